@@ -24,7 +24,7 @@ from lusee_bayes.report.viewer import viewer
 from lusee_bayes.results.channel import Judged
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
 from lusee_bayes.results.prior_comparison import PriorsSummary, prior_table
-from lusee_bayes.results.summaries import SamplingSummary, ValidationSummary
+from lusee_bayes.results.summaries import MapSummary, SamplingSummary, ValidationSummary
 
 # number of days in the table, worst first
 WORST_DAYS = 5
@@ -45,9 +45,9 @@ def map_page(folder: Path, name: str) -> str:
     InputError
         If a file is missing in the folder.
     """
-    require_files(folder, ("summary.json", "scenario.yaml", "diagnostics.nc"), "map")
     run = FinishedRun.read(folder)
-    summary, channels = run.summary, run.channels
+    summary = read_model(folder / "summary.json", MapSummary, "the figures of a map run")
+    channels = run.channels
     tests = N_TESTS * len(channels)
     return render_run(
         "map.html",

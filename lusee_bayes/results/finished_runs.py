@@ -36,9 +36,8 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.map_result import MapResult
+from lusee_bayes.results.map_result import MapResult, spectrum_of
 from lusee_bayes.results.sky_spectrum import IndexMaps, SkySpectrum
-from lusee_bayes.results.summaries import MapSummary
 
 
 def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
@@ -422,10 +421,9 @@ class Provenance(BaseModel, frozen=True):
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A finished map run: the name of its folder, its figures, its channels, and its origin."""
+    """A finished map run: the name of its folder, its channels, and their origin."""
 
     name: str
-    summary: MapSummary
     channels: tuple[ChannelResult, ...]
     provenance: Provenance
 
@@ -448,8 +446,7 @@ class FinishedRun:
             raise InputError(
                 f"'{self.name}' has one frequency; make a map with --frequencies 5:50:1"
             )
-        temperatures = [channel.temperatures for channel in self.channels]
-        return SkySpectrum.of(self.summary.frequencies_mhz, temperatures)
+        return spectrum_of(self.channels)
 
     @classmethod
     def read(cls, folder: str | Path) -> FinishedRun:
@@ -457,20 +454,8 @@ class FinishedRun:
         folder = user_path(folder)
         recover(folder)
         require_files(folder, ("summary.json", "diagnostics.nc"), "map")
-        summary = read_model(folder / "summary.json", MapSummary, "the figures of a map run")
         channels = read_channels(folder / "diagnostics.nc")
-        mhz = [channel.frequency_mhz for channel in channels]
-        if mhz != summary.frequencies_mhz:
-            raise InputError(
-                f"'{folder}' contains files of different runs: summary.json is for "
-                f"{_in_mhz(summary.frequencies_mhz)}, diagnostics.nc for {_in_mhz(mhz)}; make "
-                "the map again"
-            )
-        return cls(folder.resolve().name, summary, channels, Provenance.read(folder))
-
-
-def _in_mhz(frequencies: Sequence[float]) -> str:
-    return f"{', '.join(f'{f:g}' for f in frequencies)} MHz"
+        return cls(folder.resolve().name, channels, Provenance.read(folder))
 
 
 def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
@@ -542,7 +527,7 @@ def comparison_rows(runs: Sequence[FinishedRun]) -> list[dict[str, object]]:
     return [
         {
             "run": run.name,
-            "level": run.summary.level,
+            "level": run.channel.judged.level,
             **{key: getattr(run.channel, key) for key in COMPARED},
             "log_evidence_less_best": run.channel.log_evidence - best if comparable else None,
             "instrument_p": run.channel.instrument.p,

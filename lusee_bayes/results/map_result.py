@@ -7,6 +7,7 @@ posterior of component maps.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from textwrap import wrap
@@ -51,6 +52,12 @@ def joint_prior_sentence(scenario: Scenario) -> str:
         sky = f"the embedded template times the exponential of {', '.join(section.fields)}"
         return f"Prior spectral.model=positive: {sky}, with C_ell learned from these data; {kept}."
     return f"Prior spectral.model={section.model}, C_ell from the scenario's skies; {kept}."
+
+
+def spectrum_of(channels: Sequence[ChannelResult]) -> SkySpectrum:
+    """Temperatures of regions of the sky in all channels."""
+    frequencies = [channel.frequency_mhz for channel in channels]
+    return SkySpectrum.of(frequencies, [channel.temperatures for channel in channels])
 
 
 def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:
@@ -352,8 +359,7 @@ class MapResult(Described):
 
     def sky_spectrum(self) -> SkySpectrum:
         """Temperatures of regions of the sky."""
-        temperatures = [channel.temperatures for channel in self.channels]
-        return SkySpectrum.of(self.frequencies_mhz.tolist(), temperatures)
+        return spectrum_of(self.channels)
 
     def index_maps(self) -> IndexMaps | None:
         """Maps of the spectral index of a joint posterior; None for less than three channels."""

@@ -20,6 +20,7 @@ from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.results.channel_map import conditioned, region_rows
 from lusee_bayes.results.finished_runs import FinishedRun, SavedInformation
+from lusee_bayes.results.summaries import MapSummary
 from lusee_bayes.testing import small_scenario
 
 
@@ -130,7 +131,8 @@ def test_groups_of_a_channel_are_judged_where_it_does_not_fit(judged_run):
 
 
 def test_they_are_named_wherever_the_verdict_is(judged_run):
-    result, summary = judged_run.result, FinishedRun.read(judged_run.folder).summary
+    result, path = judged_run.result, judged_run.folder / "summary.json"
+    summary = MapSummary.model_validate_json(path.read_bytes())
     assert result.fit.level == summary.level == "does not fit"
     assert f"25 MHz: {result.channels[1].judged.fit.details}" in result.verdict()
     assert summary.verdict == result.verdict()

@@ -17,6 +17,7 @@ from lusee_bayes.instrument.beams import fields as beam_fields
 from lusee_bayes.instrument.beams.fields import AntennaFields, HemisphereGrid, stokes_beam
 from lusee_bayes.instrument.products import to_real
 from lusee_bayes.results.finished_runs import FinishedRun
+from lusee_bayes.results.summaries import MapSummary
 from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.field_errors import STD, FieldErrors, FieldErrorsSection, of_ell
 
@@ -172,7 +173,8 @@ def test_a_report_has_the_share_of_the_variance_that_they_add(tmp_path):
     assert theta.table["n"].tolist() == [1, 16, 48]
     assert theta.table["unknown"].tolist()[1:] == ["field_error_0", "field_error_1"]
     assert theta.corner["unknown"].tolist() == ["zenith_angle_deg"]
-    summary = FinishedRun.read(run.folder).summary.channels[0].theta
+    text = (run.folder / "summary.json").read_text(encoding="utf-8")
+    summary = MapSummary.model_validate_json(text).channels[0].theta
     assert summary["shares"] == pytest.approx(theta.shares, rel=1e-12)
     page = (run.folder / "report.html").read_text(encoding="utf-8")
     assert "<td>field_error_1</td><td>48</td>" in page and "Posterior of pairs of unknowns" in page
