@@ -7,7 +7,7 @@ import xarray as xr
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from lusee_bayes.core.harmonics import lmax_of, taper_fwhm_deg
@@ -58,7 +58,7 @@ def data_by_product(cases: Cases) -> Figure:
 
 def frequency_maps(cases: Cases) -> Figure:
     """Figure 4: truth, posterior mean and relative difference, at five frequencies."""
-    figure, panels = drawing.framed((18, 9), 3, len(SHOWN_FREQUENCIES))
+    figure, panels = drawing.framed((20, 6.5), 3, len(SHOWN_FREQUENCIES))
     for column, frequency in enumerate(SHOWN_FREQUENCIES):
         case = cases[frequency_case(frequency)]
         mean, truth = (drawn(case, name) for name in ("mean", "truth"))
@@ -72,10 +72,9 @@ def frequency_maps(cases: Cases) -> Figure:
             ("difference", percent, signed, drawing.DIVERGING, seen),
         ]
         for row, (name, pixels, scale, cmap, altitude) in enumerate(rows):
-            axes, style = panels[row, column], {"cmap": cmap, "highest_altitude": altitude}
-            image = drawing.mollweide(axes, pixels, norm=scale, **style)
-            axes.set_title(f"{frequency} MHz, {name}", fontsize=10)
-            flat_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
+            unit = "K" if row < 2 else "% of the mean sky"
+            given = f"{frequency} MHz, {name}", pixels, scale, cmap, unit
+            drawing.sky_panel(panels[row, column], *given, altitude=altitude, shrink=0.7, pad=0.02)
     figure.suptitle(f"Galactic coordinates, longitude grows to the left; {_how_drawn(case)}")
     return figure
 
@@ -89,18 +88,6 @@ def _how_drawn(case: xr.Dataset) -> str:
 def drawn(case: xr.Dataset, name: str) -> Float[np.ndarray, " pixels"]:
     """Map of ``mean`` or ``truth``, smoothed with the taper's beam as in reports."""
     return drawing.shown(case[f"{name}_modes"].values, healpy.npix2nside(case.sizes["pixel"]))
-
-
-def flat_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
-    """A flat colour bar below the axes; a logarithmic one has three rounded numbers."""
-    style = {"location": "bottom", "shrink": 0.7, "extend": "both", "pad": 0.04}
-    aspect = 30 if isinstance(axes, Axes) else 60
-    bar = figure.colorbar(image, ax=axes, label=unit, aspect=aspect, **style)
-    if isinstance(image.norm, LogNorm):
-        bounds = image.norm.vmin, image.norm.vmax
-        ticks = [float(f"{value:.1e}") for value in np.geomspace(*bounds, 3)]
-        bar.set_ticks(np.clip(ticks, *bounds), labels=[f"{tick:,.0f}" for tick in ticks])
-        bar.set_ticks([], minor=True)
 
 
 def by_frequency(cases: Cases, metric: str) -> Figure:
@@ -169,7 +156,8 @@ def scenario_maps(cases: Cases) -> Figure:
     for axes, (title, pixels, altitude) in zip(panels.flat, shown, strict=True):
         image = drawing.mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
         axes.set_title(title, fontsize=11)
-    flat_bar(figure, figure.axes, image, "K")
+    bar = {"location": "bottom", "aspect": 60, "shrink": 0.7, "pad": 0.04}
+    drawing.colour_bar(figure, image, figure.axes, label="K", extend="both", **bar)
     how = _how_drawn(cases["fiducial"])
     figure.suptitle(f"Maps at 25 MHz, Galactic coordinates; {how}")
     return figure
