@@ -15,7 +15,7 @@ from lusee_bayes.experiment.rounds import Inference, learned_prior, named_priors
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.judge.residuals import held_out
 from lusee_bayes.judge.split import Split
-from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
+from lusee_bayes.report.figures.maps import map_fidelity, maps_of_runs
 from lusee_bayes.report.figures.plans import priors
 from lusee_bayes.report.pages import comparison_page
 from lusee_bayes.report.rendering import render_text
@@ -63,7 +63,10 @@ def _write_page(runs: list[FinishedRun], folder: Path) -> None:
 COMPARISON = RunKind(
     "compare",
     outputs=(Output(_write_page), Output.rows("comparison.csv", comparison_rows)),
-    figures={"maps": maps_of_runs, "curves": curves_of_runs},
+    figures={
+        "maps": maps_of_runs,
+        "curves": lambda runs: map_fidelity({run.name: run.channel for run in runs}),
+    },
     dpi=100,
 )
 

@@ -39,7 +39,7 @@ def test_the_right_model_wins(runs, tmp_path, capsys):
     page = (out / "comparison.html").read_text()
     assert "All runs map the same data" in page and "gain_1e-2" in page
     assert page.count("a library call") == page.count("with its true sky") == 2
-    assert page.count("data:image/png;base64,") == 2 * 2 + 1 and "://" not in page
+    assert page.count("data:image/png;base64,") == 2 * 2 + 3 and "://" not in page
     assert_drawn(*(out / "figures").iterdir())
 
 

@@ -181,42 +181,41 @@ def channel_map(channel: ChannelResult) -> Figure:
     return figure
 
 
-def map_fidelity(channel: ChannelResult) -> Panels:
-    """rho_ell and SNR_ell if the truth is known, and the prior's share of each ell's variance."""
-    spectra = channel.spectra()
-    names = ["correlation", "signal-to-noise", "share of the prior"][0 if "snr" in spectra else 2 :]
+def map_fidelity(channels: Mapping[str, ChannelResult]) -> Panels:
+    """rho_ell and SNR_ell if the truth is known, and the prior's share of each ell's variance.
+
+    One curve for each channel, by its label; for a single one, also the first ell with SNR < 1.
+    """
+    spectra = {label: channel.spectra() for label, channel in channels.items()}
+    with_truth = all("snr" in columns for columns in spectra.values())
+    names = ["correlation", "signal-to-noise", "share of the prior"][0 if with_truth else 2 :]
     drawn = {name: drawing.framed((5, 3.6)) for name in names}
-    panels = [axes for _, axes in drawn.values()]
-    _fidelity(panels, spectra, color=BLUE)
-    panels[-1].axhline(0.5, color=GREY, lw=0.8, ls=":")
-    if "snr" in spectra:
-        panels[0].axhline(0.0, color=GREY, lw=0.8)
-        panels[1].axhline(1.0, color=GREY, lw=0.8, ls=":")
+    *fidelity, share = [axes for _, axes in drawn.values()]
+    for k, (label, columns) in enumerate(spectra.items()):
+        style = {"color": COLOURS[k % len(COLOURS)], "ls": LINES[k % len(LINES)], "label": label}
+        ell = columns["ell"][1:]
+        share.plot(ell, columns["prior_fraction"][1:], **style)
+        for axes, name in zip(fidelity, ("rho", "snr"), strict=False):
+            axes.plot(ell, columns[name][1:], **style)
+    share.set(ylabel="fraction of the variance from the prior", ylim=(0, 1.02))
+    share.axhline(0.5, color=GREY, lw=0.8, ls=":")
+    if with_truth:
+        rho, snr = fidelity
+        rho.set(ylabel=r"correlation with the truth $\rho_\ell$", ylim=(-0.25, 1.05))
+        rho.axhline(0.0, color=GREY, lw=0.8)
+        snr.set(ylabel=r"$\mathrm{SNR}_\ell$", yscale="log")
+        snr.axhline(1.0, color=GREY, lw=0.8, ls=":")
         # over many decades they are slow to draw
-        panels[1].yaxis.minorticks_off()
-        cross = ell_cross(spectra["snr"])
-        if cross is not None:
-            panels[1].axvline(cross, color=ORANGE, lw=1, ls="--", label=f"first below 1: {cross}")
-            panels[1].legend(frameon=False)
-    for axes in panels:
-        axes.set(xlim=(1, spectra["ell"][-1]))
+        snr.yaxis.minorticks_off()
+        if len(channels) == 1 and (cross := ell_cross(columns["snr"])) is not None:
+            snr.axvline(cross, color=ORANGE, lw=1, ls="--", label=f"first below 1: {cross}")
+            snr.legend(frameon=False)
+    lmax = max(columns["ell"][-1] for columns in spectra.values())
+    for axes in (*fidelity, share):
+        axes.set(xlabel=r"multipole $\ell$", xlim=(1, lmax))
+    if len(channels) > 1:
+        share.legend(frameon=False, fontsize=8)
     return {name: figure for name, (figure, _) in drawn.items()}
-
-
-def _fidelity(
-    panels: Sequence[Axes], spectra: Mapping[str, np.ndarray], label: str | None = None, **style
-) -> None:
-    """Draw the prior's share in the last panel, and rho and SNR in the others, if there are any."""
-    ell = spectra["ell"][1:]
-    panels[-1].plot(ell, spectra["prior_fraction"][1:], label=label, **style)
-    panels[-1].set(ylabel="fraction of the variance from the prior", ylim=(0, 1.02))
-    if len(panels) > 1:
-        panels[0].plot(ell, spectra["rho"][1:], **style)
-        panels[0].set(ylabel=r"correlation with the truth $\rho_\ell$", ylim=(-0.25, 1.05))
-        panels[1].semilogy(ell, spectra["snr"][1:], **style)
-        panels[1].set(ylabel=r"$\mathrm{SNR}_\ell$")
-    for axes in panels:
-        axes.set(xlabel=r"multipole $\ell$")
 
 
 def sky_spectra(channel: ChannelResult) -> Figure:
@@ -374,7 +373,7 @@ def fidelity(cube: MapResult) -> Figure | Panels:
     For one channel, as :func:`map_fidelity`.
     """
     if len(cube.channels) == 1:
-        return map_fidelity(cube.channel)
+        return map_fidelity({"": cube.channel})
     with_truth = cube.stacked("snr") is not None
     values = cube.stacked("snr" if with_truth else "prior_fraction")
     label = r"$\mathrm{SNR}_\ell$" if with_truth else "fraction of the variance from the prior"
@@ -413,19 +412,4 @@ def chi2(cube: MapResult) -> Figure | None:
     if np.isfinite(ratio).all() and ratio.max() > 3.0:
         axes.set_yscale("log")
     axes.set(xlabel="frequency [MHz]", ylabel=r"$\chi^2$ / its expectation")
-    return figure
-
-
-def curves_of_runs(runs: Sequence[FinishedRun]) -> Figure:
-    """rho_ell and SNR_ell if the truth is known, and the prior's share, for every run."""
-    spectra = [run.channel.spectra() for run in runs]
-    snr = all("snr" in one for one in spectra)
-    figure, panels = drawing.framed((12 if snr else 6, 4.2), 1, 3 if snr else 1, squeeze=False)
-    panels = list(panels.flat)
-    for k, run in enumerate(runs):
-        style = {"color": COLOURS[k % len(COLOURS)], "ls": LINES[k % len(LINES)], "lw": 1.3}
-        _fidelity(panels, spectra[k], run.name, **style)
-    if snr:
-        panels[1].axhline(1.0, color=GREY, lw=0.8)
-    panels[-1].legend(frameon=False, fontsize=8)
     return figure
