@@ -46,8 +46,8 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
 
 # coefficient of a uniform sky of 1 K
 MONOPOLE = np.sqrt(4.0 * np.pi)
-# parts of a posterior that are listed
-HOLDS = "truth", "covariance", "independent_mean", "posterior", "observed_data", "information"
+HOLDS = ("truth", "covariance", "independent_mean")
+HOLDS += ("posterior", "log_likelihood", "observed_data", "constant_data", "information")
 
 
 def describe_diagnostics(path: Path) -> list[str]:

@@ -223,6 +223,8 @@ class ChannelResult(ChannelData, Described):
         Standard deviation of HEALPix RING pixels.
     draws : (n, modes) array
         Samples from the posterior; empty unless requested.
+    log_likelihood : (n,) array
+        ln p(d | m) of each draw, with the full N.
     covariance : (modes, modes) array or None
         In K^2, if requested.
     independent : (modes,) array or None
@@ -252,6 +254,7 @@ class ChannelResult(ChannelData, Described):
     prior_fraction: Ells = quantity("1", "share of the variance that the prior supplies")
     pixel_std: Pixels = quantity("K", "posterior standard deviation of pixels")
     draws: Float[np.ndarray, "draw mode"] = quantity("K", "draws of the posterior")
+    log_likelihood: Float[np.ndarray, " draw"] = quantity("1", "ln p(d | m) of each draw")
     covariance: SkyMatrix | None = quantity("K2", "posterior covariance", default=None)
     independent: SkyModes | None = quantity("K", "mean given only its own data", default=None)
     log_evidence: float = np.nan

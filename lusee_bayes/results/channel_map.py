@@ -181,6 +181,17 @@ class Conditioned:
         """The number of draws that the scenario's output requests, in K."""
         return self.drawn[: self.experiment.scenario.output.draws]
 
+    def log_likelihood(self) -> Float[np.ndarray, " n"]:
+        """ln p(d | m) of these data for every draw."""
+        model, data = self.from_data.model, self.experiment.data.data
+        if not len(self.draws):
+            return np.zeros(0)
+        # factorised once: this takes far longer than a prediction if N couples times
+        factor = model.noise.factor()
+        white = [factor.whiten(data - model.predict(sky)) for sky in self.draws]
+        chi2 = np.array([float(one @ one) for one in white])
+        return -0.5 * (chi2 + float(factor.log_det()) + model.n_data * np.log(2.0 * np.pi))
+
     def of_all(self, data: ChannelData) -> ChannelData:
         """Replace n_data and chi^2 by those of all data, which a joint posterior uses."""
         if not self.onto:
@@ -214,7 +225,8 @@ class Conditioned:
         with (stages or Stages())("standard deviations"):
             given = data, self.posterior.mean, self.covariance, self.compared()
             more = {"pixels": self.pixel_std, "instrument": self.unknowns, **self.figures()}
-            made = channel_result(*given, draws=self.draws, **more)
+            more |= {"draws": self.draws, "log_likelihood": self.log_likelihood()}
+            made = channel_result(*given, **more)
             if not self.onto or made.unknowns is None:
                 return made
             alone = self.from_data.solution
@@ -366,7 +378,7 @@ def channel_result(
     covariance_kept : bool
         Keep the covariance with the result.
     information_bits, **figures
-        Other attributes of :class:`.ChannelResult`: ``chi2``, ``draws``, ``independent`` ...
+        Other attributes of :class:`.ChannelResult`: ``chi2``, ``draws``, ``log_likelihood`` ...
     """
     mean, covariance = np.asarray(mean), np.asarray(covariance)
     width, held, variance = pixels, (), np.diagonal(covariance)

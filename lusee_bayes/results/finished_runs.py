@@ -139,8 +139,8 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
     """Contents of posterior.nc, for xarray and, if draws were requested, for ArviZ.
 
     The root has the sky of every channel, in K, on ``frequency`` and ``mode`` with coordinates
-    ``ell`` and ``m``. ``posterior`` (draws) and ``observed_data`` follow ArviZ; ``information``, if
-    requested, has a group for each frequency.
+    ``ell`` and ``m``. ``posterior`` (draws), ``log_likelihood``, ``observed_data`` and
+    ``constant_data`` follow ArviZ; ``information``, if requested, has a group for each frequency.
     """
     scenario, joint, channels = result.scenario, result.joint, result.channels
     ell, m = mode_numbers(scenario.lmax)
@@ -162,13 +162,15 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
     coords = {**axis, "ell": ("mode", ell), "m": ("mode", m)}
     unmapped = {"unmapped": "\n".join(result.gaps())} if result.unmapped else {}
     attrs = formats.header(formats.POSTERIOR) | attributes_of(scenario) | unmapped
-    groups = {"/": xr.Dataset(variables, coords, attrs)}
-    groups["observed_data"] = _observed(channels, axis)
-    draws = result.stacked("draws")
+    groups = {"/": xr.Dataset(variables, coords, attrs), **_observed(channels, axis)}
+    draws, likely = result.stacked("draws"), result.stacked("log_likelihood")
     if draws.size:
         chains = {"chain": [0], "draw": np.arange(draws.shape[1])}
-        sky = (("chain", "draw", *on_modes), draws.swapaxes(0, 1)[None], kelvin)
+        dims = ("chain", "draw", "frequency")
+        sky = ((*dims, "mode"), draws.swapaxes(0, 1)[None], kelvin)
         groups["posterior"] = xr.Dataset({"sky": sky}, {**chains, **coords})
+        data = (dims, likely.T[None], {"units": "1"})
+        groups["log_likelihood"] = xr.Dataset({"visibility": data}, {**chains, **axis})
     for channel in channels:
         if channel.information is not None:
             kept = SavedInformation(channel.information, channel.digests)
@@ -176,15 +178,17 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
     return xr.DataTree.from_dict(groups)
 
 
-def _observed(channels: Sequence[ChannelResult], axis: dict) -> xr.Dataset:
+def _observed(channels: Sequence[ChannelResult], axis: dict) -> dict[str, xr.Dataset]:
     """The data and their times; NaN at times that a channel lacks."""
     parts = []
     for channel in channels:
         coords = {"product": list(channel.labels), "time": ("time", channel.hours, HOURS)}
         grid = (("product", "time"), channel.data, {"units": "K"})
-        parts.append(xr.Dataset({"visibility": grid}, coords))
+        angle = ("time", channel.turntable_deg, {"units": "degree"})
+        parts.append(xr.Dataset({"visibility": grid, "turntable_deg": angle}, coords))
     along = xr.Variable(*axis["frequency"]).to_index_variable()
-    return xr.concat(parts, along, join="outer")
+    whole = xr.concat(parts, along, join="outer")
+    return {"observed_data": whole[["visibility"]], "constant_data": whole[["turntable_deg"]]}
 
 
 INFORMATION = "information"
@@ -287,7 +291,8 @@ def diagnostics_tree(result: MapResult) -> xr.DataTree:
     """Contents of diagnostics.nc: all other results, a group for each frequency."""
     groups = {}
     for channel in result.channels:
-        kept = replace(channel, draws=channel.draws[:0], covariance=None, information=None)
+        kept = replace(channel, draws=channel.draws[:0], log_likelihood=channel.log_likelihood[:0])
+        kept = replace(kept, covariance=None, information=None)
         groups[f"{channel.frequency_mhz:.15g}"] = to_tree(kept)
     root = xr.Dataset(attrs=formats.header(formats.DIAGNOSTICS) | attributes_of(result.scenario))
     return xr.DataTree(root, children=groups)

@@ -191,6 +191,7 @@ class ChannelInformation:
             covariance,
             drawn - mean,
             draws=drawn[:n_draws],
+            log_likelihood=information.log_likelihood(sky.draws[:n_draws]),
             instrument=unknowns,
             joint=drawn,
             independent=np.asarray(self.information.reference),
@@ -443,12 +444,14 @@ class ChannelAlone:
         bits = self.figures["information_bits"] - 0.5 * gained / np.log(2.0)
         information = information_given(self.information, amplitudes, precision, vector, expansion)
         drawn, compared = np.split(deviations, [scenario.output.draws])
+        skies = moved + drawn
         return channel_result(
             self.known.given(unknowns.table(moved, left)),
             moved,
             left,
             compared,
-            draws=moved + drawn,
+            draws=skies,
+            log_likelihood=information.log_likelihood(skies),
             instrument=unknowns,
             common=gain @ tied.root[number, at],
             **(self.figures | information.fit(moved, left) | {"information_bits": float(bits)}),

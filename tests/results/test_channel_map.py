@@ -10,6 +10,7 @@ import pytest
 from commands import posterior_of, sky_draws_of
 from experiments import channels_of, correlated, mapped, scaled_product, small_experiment
 from reference_linear import matrices
+from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
@@ -23,6 +24,13 @@ from lusee_bayes.results.summaries import MapSummary
 from lusee_bayes.testing import small_scenario
 
 
+def dense_log_likelihood(model, data, skies) -> np.ndarray:
+    """ln N(d; A m + offset, N) with matrices."""
+    predicted = [np.asarray(model.predict(jnp.asarray(sky))) for sky in skies]
+    noise = stats.multivariate_normal(np.zeros(len(data)), np.asarray(model.noise.dense()))
+    return noise.logpdf(np.asarray(data) - predicted)
+
+
 def dense_z(judged, data) -> np.ndarray:
     """Every datum against all others, of independent noise: K^-1 = N^-1 - (Q of a QR) (its Q)^T."""
     model, n = on_host(judged.model), len(data)
@@ -34,23 +42,47 @@ def dense_z(judged, data) -> np.ndarray:
     return (off - q @ (q.T @ off)) / np.sqrt(1.0 - (q**2).sum(1))
 
 
+NOISES = {
+    "diagonal": (),
+    "banded": ("noise.gain={sigma: 0.01}",),
+    "templates": ("noise.radiometer.form=exact", "noise.beam={shift_mhz: 1}"),
+}
+
+
+@pytest.mark.parametrize("noise", NOISES.values(), ids=list(NOISES))
+def test_likelihoods_of_draws_are_those_of_matrices(noise):
+    made, channel = mapped(small_experiment("output.draws=4", *noise))
+    expected = dense_log_likelihood(made.from_data.model, made.experiment.data.data, channel.draws)
+    # data of 1e5 standard deviations
+    np.testing.assert_allclose(channel.log_likelihood, expected, atol=1e-6)
+    assert len(expected) == 4 and np.ptp(expected) > 0.1
+
+
 def test_arviz_opens_a_posterior(small_cube):
-    """With the groups and dimensions of ArviZ."""
+    """With the groups and dimensions of ArviZ, and the likelihood of every channel's draws."""
     tree = posterior_of(small_cube.folder)
-    assert {"posterior", "observed_data"} == set(tree.children)
+    assert {"posterior", "log_likelihood", "observed_data", "constant_data"} == set(tree.children)
     sky, result = tree["posterior"]["sky"], small_cube.result
     assert sky.dims == ("chain", "draw", "frequency", "mode") and sky.shape == (1, 3, 3, 25)
     np.testing.assert_array_equal(sky["frequency"], [20.0, 25.0, 30.0])
     assert az.extract(tree, num_samples=3).sizes["sample"] == 3
     assert len(arviz_stats.summary(tree, kind="stats")) == 75
+    assert tree["log_likelihood"]["visibility"].dims == ("chain", "draw", "frequency")
     drawn = sky_draws_of(small_cube.folder)
     scenarios = result.scenario.channels()
     for k, (channel, scenario) in enumerate(zip(result.channels, scenarios, strict=True)):
         np.testing.assert_array_equal(drawn[k], channel.draws)
-        data = lb.build(scenario).data
+        experiment = lb.build(scenario)
+        model, data = lb.infer(experiment).model, experiment.data
+        told = tree["log_likelihood"]["visibility"].isel(chain=0, frequency=k)
+        expected = dense_log_likelihood(model, data.data, channel.draws)
+        np.testing.assert_allclose(told, expected, atol=1e-6)
         seen = tree["observed_data"]["visibility"].isel(frequency=k)
         np.testing.assert_array_equal(seen, data.grid())
         assert list(tree["observed_data"]["product"].values) == list(data.labels)
+        angles = tree["constant_data"]["turntable_deg"].isel(frequency=k)
+        turntable = np.asarray(data.observation.turntable_deg)
+        np.testing.assert_array_equal(angles, turntable[data.observation.run])
 
 
 def test_data_of_channels_at_other_times_have_gaps(tmp_path, numbers_alone):
