@@ -6,14 +6,14 @@
           + sum_b f_b s_b y(b) + R sum_j w_j P [sqrt(v_j) n_j]
 
 T is a template; its scale and the monopole have wide priors. With surveys of the sky, T is their
-mean, and T_i are the surveys and the embedded template. o(k) are named extended objects, y(b)
-the point sources of the catalogue. n_j is white noise on the sphere, v_j(p) a positive field, P the
-harmonic analysis, w_j windows in ell an octave wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2).
-If all v_j = 1, the last term is an isotropic field with spectrum C_ell. Its covariance is
-R sum_j w_j W(v_j) w_j R, where the matrix W(v) multiplies by v. The logarithm of v_j is a sum of
-covariates: the template at the band's resolution, the same without absorption, the Galactic plane,
-a smooth field of low ell, and 15-degree cells for compact departures, whose factors have a
-power-law tail.
+mean, and T_i are the surveys and the embedded template. o(k) are named extended objects and, without
+surveys, broad discs all over the sky; y(b) are the point sources of the catalogue. n_j is white
+noise on the sphere, v_j(p) a positive field, P the harmonic analysis, w_j windows in ell an octave
+wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2). If all v_j = 1, the last term is an isotropic
+field with spectrum C_ell. Its covariance is R sum_j w_j W(v_j) w_j R, where the matrix W(v)
+multiplies by v. The logarithm of v_j is a sum of covariates: the template at the band's resolution,
+the same without absorption, the Galactic plane, a smooth field of low ell, and 15-degree cells for
+compact departures, whose factors have a power-law tail.
 """
 
 from __future__ import annotations
@@ -48,8 +48,13 @@ TRANSPARENT_MHZ = 50.0
 SCALE_WIDTH = MONOPOLE_WIDTH = 1.0
 # of the weights of surveys and of the embedded template
 WEIGHT_WIDTH = 1.0
+# discs (FWHM) for spurs and clouds that nothing else names, and their strength over the mean of the
+# sky. Over 30 degrees GSM2008 departs from the template by 10 % of its mean, ULSA's sky by 1 %
+DISCS_NSIDE, DISC_DEG, DISC_WIDTH = 2, 30.0, 0.05
 # C_ell of white errors, which every survey has: 0.1 % of the mean up to ell = 31, over C_0
 WHITE = 1e-6 / 1024
+# the same of any sky, 3e-5 of its mean: S of a smooth one would be singular to rounding
+LEAST_WHITE = 1e-12
 # of ln f^2: so wide that the data decide whether the catalogue's sources exist at all
 SOURCES_WIDTH = 3.0
 # NSIDE at which templates are analysed and smoothed
@@ -157,6 +162,15 @@ def smoothed_log(frequency_mhz: float, fwhm_deg: float, theta: Vector, phi: Vect
     return np.log(healpy.get_interp_val(smooth, theta, phi)) - mean_log
 
 
+def _discs(lmax: int) -> Float[np.ndarray, "discs modes"]:
+    """Gaussian discs at the centres of large HEALPix pixels, with a peak of one."""
+    directions = healpy.pix2ang(DISCS_NSIDE, np.arange(12 * DISCS_NSIDE**2))
+    fwhm = np.radians(DISC_DEG)
+    area = 2.0 * np.pi * fwhm**2 / (8.0 * np.log(2.0))
+    profile = per_mode(healpy.gauss_beam(fwhm, lmax))
+    return area * profile * synthesis_matrix(*directions, lmax)
+
+
 def hyperprior_of(centre: Parameters, width: Parameters) -> Hyperprior:
     """The prior of all parameters, given that of the spectrum's."""
     ell = np.sqrt(np.arange(1, n_modes(FIELD_LMAX))).astype(int)
@@ -176,8 +190,9 @@ class LocalScales(PriorFamily):
     ----------
     mean : (modes,) array
         T, in K.
-    wide : (modes, 2 + objects) array
-        Template, monopole and extended objects, times their standard deviations, in K.
+    wide : (modes, wide) array
+        Template, monopole, weights of surveys and extended objects, times their standard
+        deviations, in K.
     sources : (modes, sources) array
         Catalogued sources, in K.
     spectrum : (ells, parameters) array
@@ -229,7 +244,7 @@ class LocalScales(PriorFamily):
 def _covariance(family: LocalScales, flux: float, texture: ModesMatrix) -> ModesMatrix:
     columns = np.concatenate([family.wide, np.sqrt(flux) * family.sources], axis=1)
     total = columns @ columns.T + texture
-    total[np.diag_indices_from(total)] += family.white
+    total[np.diag_indices_from(total)] += max(family.white, LEAST_WHITE * family.mean[0] ** 2)
     return total
 
 
@@ -354,6 +369,8 @@ def embedded_local_scales(
         stds = np.array([[s.scale_std, np.sqrt(4.0 * np.pi) * s.zero_std] for s in surveys])
         of_scale, of_zero = np.sqrt((stds**2).sum(axis=0)) / len(surveys)
         scale, zero = of_scale * mean, of_zero * constant
+    else:
+        extended += list(DISC_WIDTH * level * _discs(lmax))
     wide = np.stack([scale, zero, *weights, *extended], axis=1)
     of_sources = np.reshape([s.modes(frequency_mhz, lmax) for s in sources], (-1, len(mean))).T
     spectrum, *expected = spectrum_basis(np.exp(_template(frequency_mhz)[1]), lmax)
