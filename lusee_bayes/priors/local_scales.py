@@ -6,14 +6,14 @@
           + sum_b f_b s_b y(b) + R sum_j w_j P [sqrt(v_j) n_j]
 
 T is a template; its scale and the monopole have wide priors. With surveys of the sky, T is their
-mean, and T_i are the surveys and the embedded template. o(k) are named extended objects and, without
-surveys, broad discs all over the sky; y(b) are the point sources of the catalogue. n_j is white
-noise on the sphere, v_j(p) a positive field, P the harmonic analysis, w_j windows in ell an octave
-wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2). If all v_j = 1, the last term is an isotropic
-field with spectrum C_ell. Its covariance is R sum_j w_j W(v_j) w_j R, where the matrix W(v)
-multiplies by v. The logarithm of v_j is a sum of covariates: the template at the band's resolution,
-the same without absorption, the Galactic plane, a smooth field of low ell, and 15-degree cells for
-compact departures, whose factors have a power-law tail.
+mean, and T_i are the surveys and the embedded template. o(k) are named extended objects and,
+without surveys, broad discs all over the sky; y(b) are the point sources of the catalogue. n_j is
+white noise on the sphere, v_j(p) a positive field, P the harmonic analysis, w_j windows in ell an
+octave wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2). If all v_j = 1, the last term is an
+isotropic field with spectrum C_ell. Its covariance is R sum_j w_j W(v_j) w_j R, where the matrix
+W(v) multiplies by v. The logarithm of v_j is a sum of covariates: the template at the band's
+resolution, the same without absorption, the Galactic plane, a smooth field of low ell, and
+15-degree cells for compact departures, whose factors have a power-law tail.
 """
 
 from __future__ import annotations

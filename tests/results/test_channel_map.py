@@ -42,14 +42,11 @@ def dense_z(judged, data) -> np.ndarray:
     return (off - q @ (q.T @ off)) / np.sqrt(1.0 - (q**2).sum(1))
 
 
-NOISES = {
-    "diagonal": (),
-    "banded": ("noise.gain={sigma: 0.01}",),
-    "templates": ("noise.radiometer.form=exact", "noise.beam={shift_mhz: 1}"),
-}
+# banded, and templates; diagonal below
+NOISES = ["noise.gain={sigma: 0.01}"], ["noise.radiometer.form=exact", "noise.beam={shift_mhz: 1}"]
 
 
-@pytest.mark.parametrize("noise", NOISES.values(), ids=list(NOISES))
+@pytest.mark.parametrize("noise", NOISES)
 def test_likelihoods_of_draws_are_those_of_matrices(noise):
     made, channel = mapped(small_experiment("output.draws=4", *noise))
     expected = dense_log_likelihood(made.from_data.model, made.experiment.data.data, channel.draws)
@@ -68,11 +65,9 @@ def test_arviz_opens_a_posterior(small_cube):
     assert az.extract(tree, num_samples=3).sizes["sample"] == 3
     assert len(arviz_stats.summary(tree, kind="stats")) == 75
     assert tree["log_likelihood"]["visibility"].dims == ("chain", "draw", "frequency")
-    drawn = sky_draws_of(small_cube.folder)
-    scenarios = result.scenario.channels()
-    for k, (channel, scenario) in enumerate(zip(result.channels, scenarios, strict=True)):
-        np.testing.assert_array_equal(drawn[k], channel.draws)
-        experiment = lb.build(scenario)
+    for k, channel in enumerate(result.channels):
+        np.testing.assert_array_equal(sky_draws_of(small_cube.folder)[k], channel.draws)
+        experiment = lb.build(result.scenario.channels()[k])
         model, data = lb.infer(experiment).model, experiment.data
         told = tree["log_likelihood"]["visibility"].isel(chain=0, frequency=k)
         expected = dense_log_likelihood(model, data.data, channel.draws)
