@@ -3,11 +3,11 @@
 ::
 
     m = T + s_T x_1 T + s_0 x_0 Y_00 + sum_i x_i (T_i - T) + sum_k s_k x_k o(k)
-          + sum_b f_b s_b y(b) + R sum_j w_j P [sqrt(v_j) n_j]
+          + f sum_b x_b y(b) + sum_i g_i x_i D(i) + R sum_j w_j P [sqrt(v_j) n_j]
 
 T is a template; its scale and the monopole have wide priors. With surveys of the sky, T is their
-mean, and T_i are the surveys and the embedded template. o(k) are named extended objects and,
-without surveys, broad discs all over the sky; y(b) are the point sources of the catalogue. n_j is
+mean, and T_i are the surveys and the embedded template. o(k) are named extended objects, y(b) the
+point sources of the catalogue and, without surveys, D(i) broad discs all over the sky. n_j is
 white noise on the sphere, v_j(p) a positive field, P the harmonic analysis, w_j windows in ell an
 octave wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2). If all v_j = 1, the last term is an
 isotropic field with spectrum C_ell. Its covariance is R sum_j w_j W(v_j) w_j R, where the matrix
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 from scipy import sparse
 
 from lusee_bayes.core.arrays import Ells, Modes, ModesMatrix, Vector
@@ -48,9 +48,10 @@ TRANSPARENT_MHZ = 50.0
 SCALE_WIDTH = MONOPOLE_WIDTH = 1.0
 # of the weights of surveys and of the embedded template
 WEIGHT_WIDTH = 1.0
-# discs (FWHM) for spurs and clouds that nothing else names, and their strength over the mean of the
-# sky. Over 30 degrees GSM2008 departs from the template by 10 % of its mean, ULSA's sky by 1 %
-DISCS_NSIDE, DISC_DEG, DISC_WIDTH = 2, 30.0, 0.05
+# discs (FWHM) for spurs and clouds that nothing else names, and their usual strength over the
+# mean of the sky. Over 30 degrees GSM2008 departs from the template by 10 % of its mean, ULSA's
+# sky by 1 %. The last is the standard deviation of ln g_i^2
+DISCS_NSIDE, DISC_DEG, DISC_WIDTH, DISCS_WIDTH = 2, 30.0, 0.03, 1.0
 # C_ell of white errors, which every survey has: 0.1 % of the mean up to ell = 31, over C_0
 WHITE = 1e-6 / 1024
 # the same of any sky, 3e-5 of its mean: S of a smooth one would be singular to rounding
@@ -171,14 +172,14 @@ def _discs(lmax: int) -> Float[np.ndarray, "discs modes"]:
     return area * profile * synthesis_matrix(*directions, lmax)
 
 
-def hyperprior_of(centre: Parameters, width: Parameters) -> Hyperprior:
+def hyperprior_of(centre: Parameters, width: Parameters, n_discs: int) -> Hyperprior:
     """The prior of all parameters, given that of the spectrum's."""
     ell = np.sqrt(np.arange(1, n_modes(FIELD_LMAX))).astype(int)
     named = [POWER_WIDTH, POWER_WIDTH, PLANE_WIDTH, TILTS_WIDTH, TILTS_WIDTH]
     of_field = FIELD_WIDTH / np.sqrt(2.0 * ell + 1.0)
-    widths = np.concatenate([width, [SOURCES_WIDTH], named, of_field])
+    widths = np.concatenate([width, [SOURCES_WIDTH], [DISCS_WIDTH] * n_discs, named, of_field])
     others = np.zeros(len(widths) - len(centre))
-    others[1] = TEMPLATE_POWER
+    others[1 + n_discs] = TEMPLATE_POWER
     return Hyperprior(np.concatenate([centre, others]), widths, N_CELLS)
 
 
@@ -193,8 +194,10 @@ class LocalScales(PriorFamily):
     wide : (modes, wide) array
         Template, monopole, weights of surveys and extended objects, times their standard
         deviations, in K.
-    sources : (modes, sources) array
-        Catalogued sources, in K.
+    sized : (modes, sized) array
+        Catalogued sources and discs, in K, whose strengths f and g_i are learned.
+    size_of : (sized,) array
+        Which strength is whose.
     spectrum : (ells, parameters) array
         ln C_ell as a linear function of its parameters.
     bands : tuple of Band
@@ -204,7 +207,8 @@ class LocalScales(PriorFamily):
 
     mean: Modes
     wide: Float[np.ndarray, "modes wide"]
-    sources: Float[np.ndarray, "modes sources"]
+    sized: Float[np.ndarray, "modes sized"]
+    size_of: Int[np.ndarray, " sized"]
     spectrum: Float[np.ndarray, "ells spectrum"]
     bands: tuple[Band, ...]
     hyperprior: Hyperprior
@@ -215,7 +219,7 @@ class LocalScales(PriorFamily):
 
     def averaged(self, parameters, covariance):
         member = self.at(parameters)
-        ells, flux, covariates, _ = self._split(np.eye(len(parameters)))
+        ells, sizes, covariates, _ = self._split(np.eye(len(parameters)))
         strengths = []
         for band, strength in zip(self.bands, member.strengths, strict=True):
             weight = band.window**2 * (2.0 * np.arange(len(band.window)) + 1.0)
@@ -225,8 +229,9 @@ class LocalScales(PriorFamily):
                 rows[:, 0] = 0.0
             spread = np.einsum("ij,ij->i", rows @ covariance, rows)
             strengths.append(strength * np.exp(0.5 * spread))
-        fluxes = float(np.exp(member.fluxes[0] + 0.5 * flux[0] @ covariance @ flux[0]))
-        return _covariance(self, fluxes, _texture(self, member.spectrum, strengths))
+        spread = np.einsum("ij,jk,ik->i", sizes, covariance, sizes)
+        sizes = np.exp(member.sizes + 0.5 * spread)
+        return _covariance(self, sizes, _texture(self, member.spectrum, strengths))
 
     def prior(self, covariance):
         return DensePrior(checked_cholesky("the prior covariance", covariance), mean=self.mean)
@@ -235,14 +240,24 @@ class LocalScales(PriorFamily):
         power, *others = coarse._split(parameters)
         return np.concatenate([power, np.zeros(self.spectrum.shape[1] - len(power)), *others])
 
+    @property
+    def n_sizes(self) -> int:
+        """Number of strengths f and g_i."""
+        return int(self.size_of.max(initial=0)) + 1
+
+    def summed(self, columns: Float[np.ndarray, "sized n"]) -> Float[np.ndarray, "sizes n"]:
+        """Sum over the columns of each strength."""
+        return np.equal.outer(np.arange(self.n_sizes), self.size_of) @ columns
+
     def _split(self, parameters: np.ndarray) -> list[np.ndarray]:
-        """Parameters of the spectrum, the sources, the covariates and the cells."""
-        sizes = self.spectrum.shape[1], 1, self.bands[0].covariates.shape[1]
+        """Parameters of the spectrum, the sizes, the covariates and the cells."""
+        sizes = self.spectrum.shape[1], self.n_sizes, self.bands[0].covariates.shape[1]
         return np.split(parameters, np.cumsum(sizes))
 
 
-def _covariance(family: LocalScales, flux: float, texture: ModesMatrix) -> ModesMatrix:
-    columns = np.concatenate([family.wide, np.sqrt(flux) * family.sources], axis=1)
+def _covariance(family: LocalScales, sizes: Vector, texture: ModesMatrix) -> ModesMatrix:
+    sized = np.sqrt(sizes)[family.size_of] * family.sized
+    columns = np.concatenate([family.wide, sized], axis=1)
     total = columns @ columns.T + texture
     total[np.diag_indices_from(total)] += max(family.white, LEAST_WHITE * family.mean[0] ** 2)
     return total
@@ -270,13 +285,13 @@ class LocalScalesMember(Member):
     Attributes
     ----------
     family : LocalScales
-    power, fluxes, coefficients, factors : arrays
-        Parameters of the spectrum, the sources, the covariates and the cells.
+    power, sizes, coefficients, factors : arrays
+        Parameters of the spectrum, the sizes, the covariates and the cells.
     """
 
     family: LocalScales
     power: Float[np.ndarray, " spectrum"]
-    fluxes: Float[np.ndarray, "1"]
+    sizes: Float[np.ndarray, " sizes"]
     coefficients: Covariates
     factors: Float[np.ndarray, " cells"]
 
@@ -300,43 +315,46 @@ class LocalScalesMember(Member):
 
     @property
     def covariance(self):
-        return _covariance(self.family, float(np.exp(self.fluxes[0])), self.texture)
+        return _covariance(self.family, np.exp(self.sizes), self.texture)
 
     def traces(self, matrix):
         family = self.family
         ells = 0.5 * sum_over_m(np.einsum("ij,ij->i", self.texture, matrix))
-        sources = 0.5 * np.einsum("is,ij,js->", family.sources, matrix, family.sources)
+        sized = 0.5 * np.einsum("is,ij,js->s", family.sized, matrix, family.sized, optimize=True)
         fields = []
         for band in family.bands:
             scale = _scale(band, self.spectrum)
             n = len(scale)
             fields.append(band.grid.diagonal(scale[:, None] * matrix[:n, :n] * scale)[None])
-        return self._gathered(ells[:, None], np.array([sources]), fields)[:, 0]
+        return self._gathered(ells[:, None], family.summed(sized[:, None]), fields)[:, 0]
 
     def forms(self, columns):
         family = self.family
         ells = 0.5 * sum_over_m((columns * (self.texture @ columns)).T).T
-        sources = 0.5 * ((family.sources.T @ columns) ** 2).sum(0)
+        sizes = family.summed(0.5 * (family.sized.T @ columns) ** 2)
         fields = []
         for band in family.bands:
             scale = _scale(band, self.spectrum)
             fields.append(band.grid.synthesise((scale[:, None] * columns[: len(scale)]).T) ** 2)
-        return self._gathered(ells, sources, fields)
+        return self._gathered(ells, sizes, fields)
 
     def _gathered(
-        self, ells: Float[np.ndarray, "ells n"], sources: Vector, fields: list[np.ndarray]
+        self,
+        ells: Float[np.ndarray, "ells n"],
+        sizes: Float[np.ndarray, "sizes n"],
+        fields: list[np.ndarray],
     ) -> Float[np.ndarray, "parameters n"]:
-        """Derivatives by the parameters, from the ones by ln C_ell, ln f^2 and the strengths."""
+        """Derivatives by the parameters, from those by ln C_ell, ln f^2, ln g_i^2 and v_j."""
         family = self.family
-        covariates = np.zeros((len(self.coefficients), len(sources)))
-        cells = np.zeros((N_CELLS, len(sources)))
+        covariates = np.zeros((len(self.coefficients), sizes.shape[1]))
+        cells = np.zeros((N_CELLS, sizes.shape[1]))
         for band, strength, field in zip(family.bands, self.strengths, fields, strict=True):
             area = 0.5 * np.repeat(np.asarray(band.grid.weights), band.grid.n_phi) * strength
             by_point = field.reshape(len(field), -1)
             covariates += (by_point @ (band.covariates * area[:, None])).T
             cells += band.cells.multiply(area[:, None]).T @ by_point.T
-        fluxes = np.exp(self.fluxes[0]) * sources[None]
-        return np.concatenate([family.spectrum.T @ ells, fluxes, covariates, cells])
+        sizes = np.exp(self.sizes)[:, None] * sizes
+        return np.concatenate([family.spectrum.T @ ells, sizes, covariates, cells])
 
 
 def embedded_local_scales(
@@ -362,18 +380,20 @@ def embedded_local_scales(
     # these may be brighter or darker than their surroundings
     extended = [level * one.strength * one.modes(lmax) for one in EXTENDED_OBJECTS]
     scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * mean * constant, []
+    discs = DISC_WIDTH * level * _discs(lmax).T
     if surveys:
         filled = [survey.sharpened(mean) for survey in surveys]
         weights, mean = [*filled, mean], np.mean(filled, axis=0)
         weights = [WEIGHT_WIDTH * (one * (mean[0] / one[0]) - mean) for one in weights]
         stds = np.array([[s.scale_std, np.sqrt(4.0 * np.pi) * s.zero_std] for s in surveys])
         of_scale, of_zero = np.sqrt((stds**2).sum(axis=0)) / len(surveys)
-        scale, zero = of_scale * mean, of_zero * constant
-    else:
-        extended += list(DISC_WIDTH * level * _discs(lmax))
+        scale, zero, discs = of_scale * mean, of_zero * constant, discs[:, :0]
     wide = np.stack([scale, zero, *weights, *extended], axis=1)
     of_sources = np.reshape([s.modes(frequency_mhz, lmax) for s in sources], (-1, len(mean))).T
     spectrum, *expected = spectrum_basis(np.exp(_template(frequency_mhz)[1]), lmax)
     bands = tuple(Band.of(window, frequency_mhz) for window in windows(lmax))
     white = WHITE * mean[0] ** 2 if surveys else 0.0
-    return LocalScales(mean, wide, of_sources, spectrum, bands, hyperprior_of(*expected), white)
+    sized = np.concatenate([of_sources, discs], axis=1)
+    size_of = np.concatenate([np.zeros(of_sources.shape[1], int), 1 + np.arange(discs.shape[1])])
+    hyperprior = hyperprior_of(*expected, n_discs=discs.shape[1])
+    return LocalScales(mean, wide, sized, size_of, spectrum, bands, hyperprior, white)
