@@ -43,25 +43,23 @@ class GroupsCompared:
 
     Attributes
     ----------
-    data : Visibilities
-        Gives times and labels; ``left_out`` defines which of the data are compared.
     left_out : LeftOut
+        With the data that are compared.
     chi2, degrees : (times,) arrays
         chi^2 of each time and its mean; 0 without a prediction.
     z : (products, times) array
         Deviation of each datum, in standard deviations; 0 without a prediction.
     """
 
-    data: Visibilities
     left_out: LeftOut
     chi2: Float[np.ndarray, " times"]
     degrees: Float[np.ndarray, " times"]
     z: Grid
 
     @classmethod
-    def of(cls, left_out: LeftOut, data: Visibilities) -> GroupsCompared:
+    def of(cls, left_out: LeftOut) -> GroupsCompared:
         """Leave out each time in turn."""
-        present, times = left_out.present, np.arange(data.layout.n_times)
+        present, times = left_out.present, np.arange(left_out.data.layout.n_times)
         some = np.flatnonzero(present.any(axis=0))
         of_time = [np.broadcast_to(times == k, present.shape) for k in some]
         chi2, degrees = np.zeros((2, len(times)))
@@ -69,11 +67,11 @@ class GroupsCompared:
         with np.errstate(invalid="ignore"):
             z = left_out.u / np.sqrt(left_out.inverse_diagonal)
         usable = present & np.isfinite(z) & (degrees > 0.0)
-        return cls(data, left_out, chi2, degrees, np.where(usable, z, 0.0))
+        return cls(left_out, chi2, degrees, np.where(usable, z, 0.0))
 
     def without(self, gone: GridFlags) -> GroupsCompared:
         """Compare the remaining data with the same model."""
-        return GroupsCompared.of(self.left_out.without(gone), self.data)
+        return GroupsCompared.of(self.left_out.without(gone))
 
     @property
     def size(self) -> Float[np.ndarray, " times"]:
@@ -122,7 +120,7 @@ class GroupsCompared:
         DataGroup or None
             None if no product or day stands out.
         """
-        groups = [one for one in groups_of(self.data) if one.kind in ("product", "day")]
+        groups = [one for one in groups_of(self.left_out.data) if one.kind in ("product", "day")]
         groups = [one for one in groups if (one.data & self.left_out.present).any()]
         chi2, degrees = _judged(self.left_out.each([group.data for group in groups]))
         out = _tail(chi2, degrees) < false_alarm
@@ -143,7 +141,7 @@ def _tail(chi2: Vector, degrees: Vector) -> Vector:
     return np.where(degrees > 0.0, special.chdtrc(degrees, np.maximum(chi2, 0.0)), 1.0)
 
 
-def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> GroupsCompared | None:
+def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> GroupsCompared:
     """Leave out each time in turn.
 
     The prior is wide enough for any sky (:mod:`lusee_bayes.judge.residuals`), so that a time is
@@ -157,16 +155,7 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     settle : bool
         Rebuild N around the inference until rounds converge, if they do. Otherwise use one round,
         and a prior whose width does not depend on the data: this finds obvious outliers.
-
-    Returns
-    -------
-    GroupsCompared or None
-        None if it would need too much memory.
     """
-    # if N couples times, it is also a matrix of all data
-    n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
-    if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
-        return None
     inference = settled(setup, Around(data)) if settle else None
     if inference is not None and not inference.unsettled:
         model, posterior = inference.model, inference.posterior
@@ -175,7 +164,7 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
         posterior = model.condition(data.data).posterior if settle else None
     wide = None if posterior is None else Split.of(posterior, 0.0, data.layout.size).wide
     prior = model.prior.widened(WIDER) if wide is None else wide.prior
-    return GroupsCompared.of(LeftOut(replace(model, prior=prior), data, posterior=wide), data)
+    return GroupsCompared.of(LeftOut(replace(model, prior=prior), data, posterior=wide))
 
 
 MAX_ROUNDS = 10
@@ -237,20 +226,23 @@ def fitting(
     Returns
     -------
     Fitting
-        Without flags, but with a remark, if too many data are inconsistent.
+        Without flags, but with a remark, if too many data are inconsistent, or if comparing them
+        would need too much memory.
     """
     rules, stages = _Rules.of(data, false_alarm), stages or Stages()
     gone = nothing = np.zeros(rules.present.shape, dtype=bool)
+    # if N couples times, it is also a matrix of all data
+    n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
+    if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
+        return Fitting(nothing, NOT_JUDGED)
     groups, kept = (), ""
-    start = compared(setup, data, settle=False) if rebuilds(setup) else None
-    if start is not None:
+    if rebuilds(setup):
+        start = compared(setup, data, settle=False)
         least = OBVIOUS * max(float(np.median(start.size)), 1.0)
-        _, obvious = rules.one_by_one(start, gone, nothing, least)
+        _, obvious = rules.one_by_one(start, nothing, least)
         gone = nothing if obvious is None else obvious
     for rounds in range(1, MAX_ROUNDS + 1):
-        if (start := compared(*without(setup, data, gone))) is None:
-            return Fitting(nothing, NOT_JUDGED)
-        more, auto = rules.eliminated(start, gone)
+        more, auto = rules.eliminated(compared(*without(setup, data, gone)), gone)
         kept = kept or auto
         if more is None:
             break
@@ -258,10 +250,10 @@ def fitting(
         gone, groups = gone | flagged, (*groups, *blamed)
         stages.say(
             f"  times compared at lmax={setup.scenario.lmax}, round {rounds}: "
-            f"{rules.count(gone)} of {data.layout.size} values flagged"
+            f"{rules.count(gone)} of {n} values flagged"
         )
         if not flagged.any():
-            share = rules.count(gone) / data.layout.size
+            share = rules.count(gone) / n
             remark = " ".join(filter(None, [rules.remark(gone, groups, share), kept]))
             return Fitting(gone, remark, share)
     return Fitting(nothing, f"{TOO_MANY} {kept}".strip())
@@ -309,15 +301,16 @@ class _Rules:
         return None
 
     def one_by_one(
-        self, left: GroupsCompared, gone: GridFlags, groups: GridFlags, least: float
+        self, left: GroupsCompared, before: GridFlags, least: float
     ) -> tuple[GroupsCompared, GridFlags | None]:
-        """Flag the worst data first; ``gone``, missing from ``left``, includes ``groups``.
+        """Flag the worst data first, in addition to those ``before``, missing from ``left``.
 
         Returns the last comparison, and all flags; None in their place if they are too many.
         """
+        gone = before
         while (worst := left.worst(self.false_alarm, least)).any():
             gone = gone | worst
-            if self.broken(gone, groups):
+            if self.broken(gone, before):
                 return left, None
             left = left.without(worst)
         return left, gone
@@ -333,7 +326,7 @@ class _Rules:
         of_groups = np.zeros_like(gone)
         while True:
             whole, least = gone | of_groups, FAR * float(base.size.max())
-            left, flagged = self.one_by_one(base, whole, whole, least)
+            left, flagged = self.one_by_one(base, whole, least)
             result = None if flagged is None else (flagged & ~gone, groups)
             first = first if groups else result
             if result is not None and left.worst(self.false_alarm).any():

@@ -199,6 +199,8 @@ class LeftOut:
 
     Attributes
     ----------
+    data : Visibilities
+        As given.
     present : (products, times) array of bool
         Which data are present.
     u : (products, times) array
@@ -218,7 +220,7 @@ class LeftOut:
         posterior: Posterior | None = None,
         gone: GridFlags | None = None,
     ):
-        self._model, self._data, self._layout = on_host(model), data, on_host(data.layout)
+        self._model, self.data, self._layout = on_host(model), data, on_host(data.layout)
         self._set_noise()
         self.present = np.asarray(self._layout.present)
         if gone is not None:
@@ -228,7 +230,7 @@ class LeftOut:
         self._u = self._weighted_residuals()
         self.u = self._layout.scatter(self._cells.gather(self._u.T))
         self._kept, self._whole, self._spans = None, None, {}
-        self._lost, self._day = np.full(self._u.shape, np.nan), self._data.observation.day
+        self._lost, self._day = np.full(self._u.shape, np.nan), self.data.observation.day
         short = len(self._u) <= SHARED and 16 * self._u.size * len(self._lower) <= KEPT_BYTES
         self._stretch_of = (self._day // DAYS) * (not short)
         if not self._summable or (short and self._weights.ndim == 3):
@@ -267,7 +269,7 @@ class LeftOut:
         ----------
         gone : (products, times) array of bool
         """
-        return LeftOut(self._model, self._data, gone=gone | ~self.present)
+        return LeftOut(self._model, self.data, gone=gone | ~self.present)
 
     def missed(self, group: GridFlags, stretch: Stretch | None = None) -> Missed:
         """Leave out a group.
@@ -365,7 +367,7 @@ class LeftOut:
     def _weighted_residuals(self) -> Cells:
         """u = D (d - E[d] - F z), with z = Q^-1 F^T D (d - E[d])."""
         model, z = self._model, np.zeros(len(self._lower))
-        centred = np.asarray(self._data.data) - (0.0 if model.offset is None else model.offset)
+        centred = np.asarray(self.data.data) - (0.0 if model.offset is None else model.offset)
         centred = centred - model.coupling @ model.prior.colour(model.prior.white_mean)
         n, weighted = self._n_templates, weigh(self._weights, self._by_cell(centred[:, None]))
         for _ in range(1 + REFINEMENTS):
