@@ -42,7 +42,7 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing, offset_kind, offset_names, with_offsets
 from lusee_bayes.instrument.products import all_products, auto_indices, ports
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge.chi2 import ChiSquare, stands_out, two_sided
+from lusee_bayes.judge.chi2 import ChiSquare, stands_out
 from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.judge.split import WIDER, with_sky
@@ -239,11 +239,9 @@ class UnderAnySky:
         more = max(0, n_ells - len(self.spectrum))
         spectrum = np.pad(self.spectrum, (0, more), mode="edge")[:n_ells]
         model = replace(self.model, coupling=coupling, prior=HarmonicPrior(spectrum))
-        solution = model.condition(np.asarray(self.data.data), FromInformation)
-        posterior, n = solution.posterior, model.n_data
-        chi2 = float(solution.information.chi2(posterior.mean) + posterior.prior_chi2())
-        degrees = n - with_sky(n - expected_chi2(posterior, n))
-        return ChiSquare(chi2, float(degrees)), solution
+        solution, n = model.condition(np.asarray(self.data.data), FromInformation), model.n_data
+        degrees = n - with_sky(n - expected_chi2(solution.posterior, n))
+        return ChiSquare(solution.chi2, float(degrees)), solution
 
     def under(self, beams: ProductBeams, observation: Observation, pointing: Pointing) -> ChiSquare:
         """Residual chi^2 with other beams or another observation.
@@ -578,7 +576,7 @@ def _noise_level(residuals: Residuals, data: Visibilities) -> Iterator[Proposal]
     factor = whole.chi2 / whole.degrees
     if not groups or not factor > 0.0:
         return
-    least = min(two_sided(group.chi2 / factor, group.degrees) for group in groups)
+    least = min(ChiSquare(group.chi2 / factor, group.degrees).p for group in groups)
     z = np.where(data.layout.present, data.layout.scatter(residuals.z), np.nan) / np.sqrt(factor)
     pairs = (z[:, 1:] * z[:, :-1])[np.isfinite(z[:, 1:] * z[:, :-1])]
     if stands_out(least, len(groups)) or abs(pairs.sum()) > WHITE * np.sqrt(len(pairs)):

@@ -346,8 +346,8 @@ class GridBeamSection(ScalarBeamSection, ResponseSection, SampledBeamSection):
 
 
 BEAM_SECTIONS = kinds_of(
-    MonopoleBeamSection, ScalarBeamSection, ResponseSection, SampledBeamSection
-) | kinds_of(GridBeamSection)
+    MonopoleBeamSection, ScalarBeamSection, ResponseSection, SampledBeamSection, GridBeamSection
+)
 
 
 def _complete_beam(tree: dict[str, Any]) -> None:

@@ -39,7 +39,7 @@ from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, Shared, T
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.sky.galaxy import kelvin_steradian
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.gain_table import COMMON_GAIN
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 from lusee_bayes.systematics.sources import PointSources
@@ -465,6 +465,14 @@ def _alone(experiment: Experiment, inference: Inference, part: Expanded) -> pd.D
 # offsets that are always tested, with the step of their derivatives; longitude and latitude act
 # like clock and tilt
 TESTED = {"clock_s": 10.0, "turntable_deg": 0.1, "tilt_east_deg": 0.1, "tilt_north_deg": 0.1}
+
+
+def tested_offsets(setup: Setup) -> dict[str, float]:
+    """The steps of all tested offsets, by name."""
+    n_runs = setup.observation.n_runs
+    return {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
+
+
 # if there are more days, they form groups of equal length
 MOST_STRETCHES = 31
 # acceptable rms of the terms beyond first order, over radiometer noise
@@ -531,8 +539,7 @@ def _table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
 
 def _preferred(experiment: Experiment, result: Inference, values: dict[str, float]) -> pd.DataFrame:
     setup, data, sky = experiment.setup, experiment.data, result.posterior.mean
-    n_runs = setup.observation.n_runs
-    steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
+    steps = tested_offsets(setup)
     centre = dict.fromkeys(steps, 0.0) | values
     offsets = PointingOffsets.of(shifted(setup, centre), steps, centre)
     expanded = Expanded.at(offsets, base_model(setup), Around(sky=sky, values=centre))

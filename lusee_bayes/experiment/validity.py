@@ -32,8 +32,7 @@ from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, moved, systematics
 from lusee_bayes.experiment.rounds import WIDE, Inference
-from lusee_bayes.experiment.unknowns import TESTED
-from lusee_bayes.instrument.pointing import offset_names
+from lusee_bayes.experiment.unknowns import tested_offsets
 from lusee_bayes.linear.amplitudes import AmplitudesOfSky
 from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.systematics.beam import InstrumentParameters
@@ -188,8 +187,7 @@ def errors_of(setup: Setup, *, pointing: bool) -> Iterator[tuple[Systematic, Siz
     yield InstrumentParameters(priors, setup.instrument), sizes, " %"
     if not pointing:
         return
-    runs = setup.observation.n_runs
-    steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), runs)}
+    steps = tested_offsets(setup)
     yield PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0)), steps, ""
 
 

@@ -71,7 +71,9 @@ class ChiSquare:
     @property
     def p(self) -> float:
         """Two-sided p-value: uniform from 0 to 1 if the model is correct."""
-        return two_sided(self.chi2, self.degrees)
+        tails = special.chdtr(self.degrees, self.chi2), special.chdtrc(self.degrees, self.chi2)
+        # both are one half at the median, up to rounding
+        return float(min(1.0, 2.0 * min(tails)))
 
     @property
     def fits(self) -> bool:
@@ -123,24 +125,6 @@ class Fit:
     def text(self) -> str:
         """The verdict with its details."""
         return f"{self.headline} {self.details}"
-
-
-def two_sided(chi2: float, n: float | int) -> float:
-    """Compute the two-sided p-value of a chi^2 with n degrees of freedom.
-
-    Parameters
-    ----------
-    chi2 : float
-    n : float
-        Degrees of freedom.
-
-    Returns
-    -------
-    float
-        From 0 to 1, uniform if the model is correct.
-    """
-    # both tails are one half at the median, up to rounding
-    return float(min(1.0, 2.0 * min(special.chdtr(n, chi2), special.chdtrc(n, chi2))))
 
 
 def stands_out(p: float, among: int) -> bool:

@@ -67,10 +67,9 @@ class Coverage:
 
     def row(self) -> dict[str, float]:
         """Its numbers by name, for CSV."""
-        percent = [f"{100 * level:.0f}" for level in LEVELS]
-        held = {f"held_{name}": x for name, x in zip(percent, self.held, strict=True)}
-        scatter = {f"scatter_{name}": x for name, x in zip(percent, self.scatter, strict=True)}
-        return held | scatter | {name: getattr(self, name) for name in REST}
+        names = [f"{kind}_{100 * level:.0f}" for kind in ("held", "scatter") for level in LEVELS]
+        shares = dict(zip(names, (*self.held, *self.scatter), strict=True))
+        return shares | {name: getattr(self, name) for name in REST}
 
 
 @dataclass(frozen=True)

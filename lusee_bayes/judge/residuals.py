@@ -209,13 +209,11 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
     whole = split.instrument
 
     def judged(group: DataGroup, missed: Missed) -> Group:
-        kind, name, n = group.kind, group.name, missed.n
-        if n == model.n_data:
-            return Group(kind, name, n, whole.degrees, whole.chi2, whole.p, np.nan)
-        degrees = n - with_sky(n - missed.degrees)
-        others = ChiSquare(whole.chi2 - missed.chi2, whole.degrees - degrees)
-        p = ChiSquare(missed.chi2, degrees).p
-        return Group(kind, name, n, degrees, missed.chi2, p, others.p)
+        n, own, others_p = missed.n, whole, np.nan
+        if n < model.n_data:
+            own = ChiSquare(missed.chi2, n - with_sky(n - missed.degrees))
+            others_p = ChiSquare(whole.chi2 - own.chi2, whole.degrees - own.degrees).p
+        return Group(group.kind, group.name, n, own.degrees, own.chi2, own.p, others_p)
 
     groups = groups_of(data)
     tests = tuple(map(judged, groups, left_out.each([group.data for group in groups])))

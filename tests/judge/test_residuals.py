@@ -18,7 +18,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.judge import left_out
-from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare, stands_out, two_sided
+from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare, stands_out
 from lusee_bayes.judge.left_out import KINDS, LeftOut, groups_of
 from lusee_bayes.judge.measures import preferences
 from lusee_bayes.judge.residuals import held_out, residuals
@@ -329,9 +329,9 @@ def test_data_that_are_fewer_than_the_modes_leave_little():
 def test_both_sides_count():
     for q in (1e-8, 1e-3, 0.2):
         for value in (stats.chi2.isf(q, 100), stats.chi2.ppf(q, 100)):
-            assert two_sided(float(value), 100) == pytest.approx(2 * q, rel=1e-9)
-    assert two_sided(0.0, 100) == 0.0
-    assert 0.999 < two_sided(float(stats.chi2.median(100)), 100) <= 1.0
+            assert ChiSquare(float(value), 100.0).p == pytest.approx(2 * q, rel=1e-9)
+    assert ChiSquare(0.0, 100.0).p == 0.0
+    assert 0.999 < ChiSquare(float(stats.chi2.median(100)), 100.0).p <= 1.0
 
 
 def test_one_rate_for_all_tests_of_a_report():
