@@ -43,9 +43,8 @@ from lusee_bayes.instrument.pointing import Pointing, offset_kind, offset_names,
 from lusee_bayes.instrument.products import all_products, auto_indices, ports
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import ChiSquare, stands_out
-from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.residuals import Residuals
-from lusee_bayes.judge.split import WIDER, with_sky
+from lusee_bayes.judge.split import WIDER, beside_any_sky
 from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.context import Around, Setup
@@ -239,9 +238,8 @@ class UnderAnySky:
         more = max(0, n_ells - len(self.spectrum))
         spectrum = np.pad(self.spectrum, (0, more), mode="edge")[:n_ells]
         model = replace(self.model, coupling=coupling, prior=HarmonicPrior(spectrum))
-        solution, n = model.condition(np.asarray(self.data.data), FromInformation), model.n_data
-        degrees = n - with_sky(n - expected_chi2(solution.posterior, n))
-        return ChiSquare(solution.chi2, float(degrees)), solution
+        solution = model.condition(np.asarray(self.data.data), FromInformation)
+        return beside_any_sky(solution.chi2, solution.posterior, model.n_data), solution
 
     def under(self, beams: ProductBeams, observation: Observation, pointing: Pointing) -> ChiSquare:
         """Residual chi^2 with other beams or another observation.

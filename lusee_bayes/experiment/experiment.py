@@ -84,10 +84,6 @@ class Experiment(Described):
 
 # largest matrix of data and modes above lmax, in numbers: 4 GB
 MOST_ABOVE = 5e8
-GAIN_ERRORS = (
-    "The stated errors of the gains (flight.gain_std, or the gain table's) are not part of N: give "
-    "noise.gain_table={}."
-)
 
 
 def build(
@@ -133,14 +129,18 @@ def observed(
     Parameters and errors are as in :func:`build`, except that no prior has to converge.
     """
     stages = stages or Stages()
+    if data is None:
+        setup = set_up(scenario, stages=stages)
+        with stages("noise"):
+            return Experiment(setup, simulate(setup).with_truth_up_to(scenario.lmax))
     doubts, above = [], scenario.noise.above_lmax
-    if data is not None and data.truth is not None:
+    if data.truth is not None:
         if len(data.truth) <= n_modes(scenario.lmax):  # the true sky ends at lmax
             above = None
         data = data.with_truth_up_to(scenario.lmax)
     scenario = scenario.with_section("noise", above_lmax=above)
     try:
-        if above is not None and data is not None:
+        if above is not None:
             n_data, top = data.layout.size, above.top(scenario.lmax)
             if n_data * n_modes(top) > MOST_ABOVE:
                 raise InputError(
@@ -149,19 +149,19 @@ def observed(
                 )
         setup = set_up(scenario, data, stages)
     except InputError as error:
-        if above is None or data is None:
+        if above is None:
             raise
         # this raises any error that does not come from the sky above lmax
         setup = set_up(scenario.with_section("noise", above_lmax=None), data, stages)
         doubts.append(f"The model ends at lmax = {scenario.lmax}, but the sky does not: {error}.")
-    if data is None:
-        with stages("noise"):
-            return Experiment(setup, simulate(setup).with_truth_up_to(scenario.lmax))
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     doubts += require_plausible(data, setup.signal, std)
     gains_known = data.calibration is not None and data.calibration.gain_names
     if gains_known and scenario.noise.gain_table is None:
-        doubts.append(GAIN_ERRORS)
+        doubts.append(
+            "The stated errors of the gains (flight.gain_std, or the gain table's) are not part of "
+            "N: give noise.gain_table={}."
+        )
     for doubt in doubts:
         stages.say(f"  doubtful: {doubt}")
     return Experiment(setup, data, tuple(doubts))

@@ -157,18 +157,19 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     scenario's bandwidth and duty cycle.
     """
     section = setup.scenario.noise.radiometer
-    visibilities = noise_visibilities(setup, around or Around(), radiometer_about(setup))
+    around = around or Around()
+    visibilities = noise_visibilities(setup, around, radiometer_about(setup))
     if setup.calibration is not None:
         given = {"bandwidth_hz": 1.0, "step_s": setup.calibration.n_averaged}
     else:
         given = section.model_dump(include={"bandwidth_hz", "duty_cycle"})
         given["step_s"] = setup.observation.live_s
-    tempered = 1.0 if around is None else around.tempered
+    given["factor"] = section.factor
+    if around.tempered == 1.0:
+        return radiometer_noise(visibilities, setup.layout, **given, form=section.form)
     # far from the mode, without the directions in which correlated noise is smallest
-    form = section.form if tempered == 1.0 else "paper"
-    common = {"form": form, "factor": section.factor}
-    noise = radiometer_noise(visibilities, setup.layout, **given, **common)
-    return noise if tempered == 1.0 else noise.scaled(tempered)
+    noise = radiometer_noise(visibilities, setup.layout, **given, form="paper")
+    return noise.scaled(around.tempered)
 
 
 def moved(setup: Setup, values: Truth | None) -> Setup:

@@ -140,8 +140,7 @@ class ChannelFits:
             p_value = probability(min(1.0, test.n * test.p))
             times = f" among {test.n}" if test.n > 1 else ""
             sentences.append(f"{test.name.capitalize()}: {test.found} (p {p_value}{times}).")
-        extremes = self.extremes()
-        if extremes:
+        if extremes := self.extremes():
             frequencies = self.frequencies_mhz
             names = [f"{frequencies[k]:g} MHz (p {probability(float(p[k]))})" for k in extremes]
             sentences.append(f"{len(extremes)} of {len(p)} channels flagged: {in_brief(names)}.")

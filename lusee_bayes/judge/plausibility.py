@@ -92,11 +92,10 @@ def _about_range(
         return ()
     ratio = float(np.median(autos[present] / modelled[present]))
     finding = f"auto-correlations are {ratio:.2g} times those of the modelled sky"
+    advice = "check the unit of the data, their frequency and the beams"
     if not 1.0 / IMPOSSIBLE < ratio < IMPOSSIBLE:
-        advice = "check the unit of the data, their frequency and the beams"
         raise InputError(f"the {finding}; {advice}")
-    doubt = f"The {finding}: check the unit of the data, their frequency and the beams."
-    return () if 1.0 / DOUBTFUL < ratio < DOUBTFUL else (doubt,)
+    return () if 1.0 / DOUBTFUL < ratio < DOUBTFUL else (f"The {finding}: {advice}.",)
 
 
 def _about_crosses(data: Visibilities, values: Grid, sigma: Grid) -> tuple[str, ...]:

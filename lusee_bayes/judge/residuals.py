@@ -77,8 +77,6 @@ class Residuals:
 
     Attributes
     ----------
-    predicted : (data,) array
-        A mean + offset, in K.
     z : (data,) array
         Each datum minus its prediction by all others, in standard deviations: N(0, 1) or narrower,
         and not independent. NaN if groups are not judged.
@@ -89,7 +87,6 @@ class Residuals:
         the test would need too large an A (:meth:`.LeftOut.of`).
     """
 
-    predicted: DataVector
     z: DataVector
     split: Split
     groups: tuple[Group, ...]
@@ -201,11 +198,10 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
         If the model cannot be factorised.
     """
     model, layout = solution.model, data.layout
-    predicted = np.asarray(model.predict(solution.posterior.mean))
     split = Split.of(solution.posterior, solution.chi2, model.n_data, solution.matrix)
     left_out = LeftOut.of(replace(model, prior=split.wide.prior), data, split.wide)
     if left_out is None:
-        return Residuals(predicted, np.full(model.n_data, np.nan), split, ())
+        return Residuals(np.full(model.n_data, np.nan), split, ())
     whole = split.instrument
 
     def judged(group: DataGroup, missed: Missed) -> Group:
@@ -218,7 +214,7 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
     groups = groups_of(data)
     tests = tuple(map(judged, groups, left_out.each([group.data for group in groups])))
     z = layout.gather(left_out.u) / np.sqrt(layout.gather(left_out.inverse_diagonal))
-    return Residuals(predicted, z, split, tests)
+    return Residuals(z, split, tests)
 
 
 @dataclass(frozen=True)

@@ -71,9 +71,13 @@ class Split:
             # data that do not fit require a sky that is brighter by orders of magnitude, under
             # which float64 cannot separate noise from sky; they stand out under this one, too
             wide, less = widened(posterior, WIDER, matrix)
-        degrees = n_data - with_sky(n_data - expected_chi2(wide, n_data))
-        instrument = ChiSquare(chi2 - less, float(degrees))
-        return cls(instrument, ChiSquare(less, float(n_data - degrees)), wide)
+        instrument = beside_any_sky(chi2 - less, wide, n_data)
+        return cls(instrument, ChiSquare(less, n_data - instrument.degrees), wide)
+
+
+def beside_any_sky(chi2: float, wide: Posterior, n_data: int) -> ChiSquare:
+    """The part of chi^2 that remains under a wide prior, with its degrees of freedom."""
+    return ChiSquare(chi2, float(n_data - with_sky(n_data - expected_chi2(wide, n_data))))
 
 
 def with_sky(directions: float) -> float:
