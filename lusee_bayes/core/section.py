@@ -136,7 +136,8 @@ def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: 
     kinds : mapping
         The section of each ``model``.
     complete : callable
-        Adds missing entries to the section's tree in place: at least ``model``.
+        Adds missing entries to the section's tree in place; without a ``model``, the first kind
+        is used.
     strict : bool
         Refuse a key of another kind whose value is not that kind's default.
     """
@@ -146,6 +147,7 @@ def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: 
             return value
         tree = dict(value)
         complete(tree)
+        tree["model"] = tree.get("model") or next(iter(kinds))
         chosen = kinds.get(tree["model"]) if isinstance(tree["model"], str) else None
         if chosen is None:
             return tree

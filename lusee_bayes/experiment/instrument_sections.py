@@ -352,12 +352,10 @@ BEAM_SECTIONS = kinds_of(
 
 def _complete_beam(tree: dict[str, Any]) -> None:
     """Complete ``beam: {file: ...}`` without a model, as in older scenarios: the file decides."""
-    default = MonopoleBeamSection.model_fields["model"].default
-    tree["model"] = tree.get("model") or default
     file = tree.get("file")
-    if tree["model"] == default and file is not None:
+    if (tree.get("model") or "monopole") == "monopole" and file is not None:
         tree["model"] = beam_kind(file) if isinstance(file, str) else "luseepy"
-    if tree["model"] not in ("response", "grid") and tree.get("receiver") == "jfet":
+    if tree.get("model") not in ("response", "grid") and tree.get("receiver") == "jfet":
         del tree["receiver"]  # scenarios of version 0.1 contained the keys of all kinds
 
 

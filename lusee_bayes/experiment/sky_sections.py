@@ -170,9 +170,7 @@ SKY_SECTIONS = kinds_of(GalaxySection, FileSkySection)
 
 def _complete_sky(tree: dict[str, Any]) -> None:
     """Complete ``sky: {file: ...}`` without a model, as in older scenarios."""
-    default = GalaxySection.model_fields["model"].default
-    tree["model"] = tree.get("model") or default
-    if tree["model"] == default and tree.get("file") is not None:
+    if (tree.get("model") or "galaxy") == "galaxy" and tree.get("file") is not None:
         tree["model"] = "file"
 
 
@@ -312,11 +310,10 @@ PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)
 
 def _complete_prior(tree: dict[str, Any]) -> None:
     """Choose the model by the entries if there is none: isotropic for those of older scenarios."""
-    if not tree.get("model"):
-        isotropic = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
-        default = IsotropicPriorSection if isotropic else LocalScalesPriorSection
-        tree["model"] = default.model_fields["model"].default
-    if tree["model"] != "isotropic":  # another kind replaces the paper's prior
+    isotropic = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
+    if isotropic and not tree.get("model"):
+        tree["model"] = "isotropic"
+    if tree.get("model") != "isotropic":  # another kind replaces the paper's prior
         tree.pop("spectrum", None)
 
 
