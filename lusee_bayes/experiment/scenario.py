@@ -60,21 +60,19 @@ def _place(node: dict[str, Any] | list[Any], key: str, override: str) -> int | s
     return int(key)
 
 
-def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) -> str:
+def one_sentence(error: ValidationError, source: str | Path) -> str:
     """Describe an unknown key, or else the first mistake: entry, value and the expected one.
 
     Parameters
     ----------
     error : ValidationError
         Error of pydantic.
-    source : str
+    source : str or path
         Origin of the scenario.
-    model : type
-        The model that validated it.
     """
     # a misspelt key is also missing
     first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
-    path, sections = _resolved(first["loc"], model)
+    path, sections = _resolved(first["loc"])
     where = ".".join(path)
     if first["type"] == "extra_forbidden":
         keys = {name for section in sections for name in section.model_fields}
@@ -98,16 +96,14 @@ def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) ->
     return f"{source}: {where} is {got!r}, but {expected}{more}"
 
 
-def _resolved(
-    location: tuple[int | str, ...], model: type[BaseModel]
-) -> tuple[list[str], list[type[BaseModel]]]:
+def _resolved(location: tuple[int | str, ...]) -> tuple[list[str], list[type[BaseModel]]]:
     """The path as a user writes it, and all kinds of the section that contains its last key.
 
     For a section with several kinds, pydantic inserts the ``model`` into the path. The key may be
     meant for another kind: ``sky.fil=X`` is read as a key of the galaxy.
     """
     path: list[str] = []
-    sections = inner = [model]
+    sections = inner = [Scenario]
     kinds: set[str] = set()
     for key in location:
         if key in kinds:
@@ -359,7 +355,7 @@ def _validate(tree: dict[Any, Any], source: str | Path) -> Scenario:
     try:
         return Scenario.model_validate(tree)
     except ValidationError as error:
-        raise InputError(one_sentence(error, str(source), Scenario)) from error
+        raise InputError(one_sentence(error, source)) from error
 
 
 def _read_yaml(source: str | Path) -> dict[Any, Any]:
