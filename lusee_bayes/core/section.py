@@ -147,14 +147,13 @@ def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: 
             return value
         tree = dict(value)
         complete(tree)
-        tree["model"] = tree.get("model") or next(iter(kinds))
-        chosen = kinds.get(tree["model"]) if isinstance(tree["model"], str) else None
-        if chosen is None:
+        model = tree["model"] = tree.get("model") or next(iter(kinds))
+        if not isinstance(model, str) or model not in kinds:
             return tree
         kept = {}
         for key, entry in tree.items():
             others = [k for k in kinds.values() if key in k.model_fields]
-            if key in chosen.model_fields or not others:
+            if key in kinds[model].model_fields or not others:
                 kept[key] = entry
                 continue
             default = others[0].model_fields[key].get_default(call_default_factory=True)
@@ -162,7 +161,7 @@ def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: 
             plain = list(default) if isinstance(default, tuple) else default
             if strict and entry not in (None, default, plain):
                 names = ", ".join(name for name, kind in kinds.items() if kind in others)
-                raise ValueError(f"{key} belongs to model {names}, not to {tree['model']}")
+                raise ValueError(f"{key} belongs to model {names}, not to {model}")
         return kept
 
     kind = Field(discriminator="model")
