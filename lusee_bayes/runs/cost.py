@@ -76,14 +76,6 @@ class Cost:
         each = CHANNEL_S + DATUM_S * self.n_data
         return OVERHEAD_S + self.n_channels * each + self.operations / _operations_a_second()
 
-    def line(self) -> str:
-        """Data, unknowns and memory in a line for a terminal."""
-        channels = f"{self.n_channels} channels of " if self.n_channels > 1 else ""
-        return (
-            f"  {channels}{self.n_data:,} data, {self.n_unknowns:,} unknowns: about "
-            f"{gigabytes(self.memory)} of memory"
-        )
-
 
 def demand_of(*scenarios: Scenario, n_draws: int = 0) -> Demand:
     """Resources for independent posteriors, or for the channels of a scenario."""
@@ -235,8 +227,11 @@ def require_resources(
     cost = posterior_cost(scenario, n_draws, n_data)
     require_fits(cost, scenario, n_draws, n_data)
     if stages.console is not None:
+        channels = f"{cost.n_channels} channels of " if cost.n_channels > 1 else ""
+        size = f"{channels}{cost.n_data:,} data, {cost.n_unknowns:,} unknowns"
         # the estimated time does not include sampling
-        stages.say(cost.line() + ("" if n_draws else f" and {duration(cost.seconds)}"))
+        time_too = "" if n_draws else f" and {duration(cost.seconds)}"
+        stages.say(f"  {size}: about {gigabytes(cost.memory)} of memory{time_too}")
 
 
 def measured_experiment(

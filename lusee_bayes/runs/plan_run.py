@@ -266,7 +266,7 @@ def length(runs: Sequence[RunSection]) -> str:
 
 def kept_forecast(folder: Path, variation: Variation) -> Forecast:
     """Read the forecast of a variation from its JSON file in a folder, or make and write it."""
-    path = folder / f"{_digest(variation)}.json"
+    path = folder / f"{identity_of(variation.scenario, variation.lost)}.json"
     if path.is_file():
         kept = json.loads(path.read_text(encoding="utf-8"))
         return Forecast(variation, **kept | {"snr_squared": np.array(kept["snr_squared"])})
@@ -276,11 +276,6 @@ def kept_forecast(folder: Path, variation: Variation) -> Forecast:
     with replacing(path) as scratch:
         scratch.write_text(json.dumps(kept), encoding="utf-8")
     return made
-
-
-def _digest(variation: Variation) -> str:
-    """Digest of everything that determines a forecast."""
-    return identity_of(variation.scenario, variation.lost)
 
 
 def forecasts_of(
@@ -309,9 +304,10 @@ def forecasts_of(
     """
     # workers may have another working directory
     anchored = [replace(v, scenario=v.scenario.anchored()) for v in variations]
+    digests = [identity_of(v.scenario, v.lost) for v in anchored]
     different: dict[str, Variation] = {}
-    for variation in anchored:
-        different.setdefault(_digest(variation), variation)
+    for digest, variation in zip(digests, anchored, strict=True):
+        different.setdefault(digest, variation)
     stages.say(f"  {len(variations)} variations, {len(different)} of them different")
     first, *others = different.values()
     start = time.perf_counter()
@@ -323,11 +319,8 @@ def forecasts_of(
         names = [f"{other.source}, {other.name}" for other in others]
         tasks = Tasks(partial(kept_forecast, folder), others, names)
         made += engine.each(tasks, stages, "planning")
-    by_digest = {_digest(one.variation): one for one in made}
-    return [
-        replace(by_digest[_digest(whole)], variation=as_given)
-        for as_given, whole in zip(variations, anchored, strict=True)
-    ]
+    by_digest = dict(zip(different, made, strict=True))
+    return [replace(by_digest[d], variation=v) for d, v in zip(digests, variations, strict=True)]
 
 
 UNFINISHED = "unfinished-forecasts"
@@ -363,12 +356,12 @@ def run_plan(
         memory.
     """
     engine, stages = engine or ThisProcess(), stages or Stages()
-    for v in variations:
-        with naming(f"{v.source}, {v.family}, {v.name}"):
-            require_fits(posterior_cost(v.scenario), v.scenario)
     scenarios = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
+    for name, scenario in scenarios.items():
+        with naming(name):
+            require_fits(posterior_cost(scenario), scenario)
     digests = {name: text_hash(s.to_yaml())[:12] for name, s in scenarios.items()}
-    inputs = [path for v in variations for path in inputs_of(v.scenario)]
+    inputs = [path for scenario in scenarios.values() for path in inputs_of(scenario)]
     with run_folder(folder, PLAN, None, None, *inputs, replace=replace, **digests) as run:
         engine.work_in(run.path)
         made = (run.path / UNFINISHED).resolve()
