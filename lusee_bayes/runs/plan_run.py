@@ -205,7 +205,6 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
     """
     observation, radiometer = scenario.observation, scenario.noise.radiometer
     scenarios, runs = {(AS_GIVEN, AS_GIVEN): scenario}, observation.runs
-    families: dict[str, list[tuple[str, Runs]]] = {}
     if observation.schedule is None:
         total = sum(run.cycles for run in runs)
         parted = [changed(runs, 1.0 / n, n, TURN_DEG) for n in PARTS]
@@ -218,9 +217,9 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
             "duration": [(length(r), r) for r in lasting],
             "nights only": [(length(r), r) for r in nights],
         }
-    for family, members in families.items():
-        for name, varied in members:
-            scenarios[family, name] = scenario.with_section("observation", runs=varied)
+        for family, members in families.items():
+            for name, varied in members:
+                scenarios[family, name] = scenario.with_section("observation", runs=varied)
     for duty in DUTY_CYCLES:
         section = radiometer.model_copy(update={"duty_cycle": duty})
         scenarios["duty cycle", f"{duty:g}"] = scenario.with_section("noise", radiometer=section)
@@ -230,16 +229,13 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
     return [Variation(source, *named, varied) for named, varied in scenarios.items()] + lost
 
 
-Runs = tuple[RunSection, ...]
-
-
 def changed(
     runs: Sequence[RunSection],
     factor: float = 1.0,
     times: int = 1,
     turn_deg: float = 0.0,
     **values: Any,
-) -> Runs:
+) -> tuple[RunSection, ...]:
     """Scale the length of runs by ``factor``, and repeat all of them ``times`` times.
 
     Each repetition adds ``turn_deg`` to the angles. ``values`` replace other keys of every run.
