@@ -121,13 +121,8 @@ def test_error_bars_of_all_together_are_right():
     assert min(kstest(one, "uniform").pvalue for one in np.transpose(below)) > 1e-3 / len(off)
 
 
-# the prior's discs take the broad structure from which a smooth sky's texture would be learned
-WORSE = pytest.mark.xfail(strict=True, reason="full is 1.31: ULSA's sky is smoother than assumed")
-CASES = [pytest.param(10.0, 1, marks=WORSE), (10.0, 2), (25.0, 1), (25.0, 2)]
-
-
 @pytest.mark.long
-@pytest.mark.parametrize(("mhz", "angles"), CASES)
+@pytest.mark.parametrize(("mhz", "angles"), [(10.0, 1), (10.0, 2), (25.0, 1), (25.0, 2)])
 def test_all_are_found_together_at_full_resolution(test_data, mhz, angles):
     truth, found = of_another_sky(test_data, mhz, angles, lmax=16, seed=1)
     away = pulls(truth, found)
