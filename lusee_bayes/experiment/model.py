@@ -302,9 +302,9 @@ def model_to_sample(
     if later and not any(isinstance(systematic, Scale) for systematic in sampled):
         noise, gains = on_device(whole.noise), any(s.scales_sky or s.needs_sky for s in sampled)
         if gains and isinstance(noise, LowRankUpdate):
-            noise = replace(noise, base=KnownFactor.of(noise.base))
+            noise = replace(noise, base=KnownFactor(noise.base, noise.base.factor()))
         else:
-            noise = KnownFactor.of(noise)
+            noise = KnownFactor(noise, noise.factor())
         model = replace(model, noise=noise)
         later = [InPlace(s) if isinstance(s, Marginalised) else s for s in later]
     if later and not any(systematic.changes_coupling for systematic in later):

@@ -154,9 +154,8 @@ class AmplitudesOfSky:
             root = np.asarray(model.noise.update.root)
             at: list[int] = []
             for column in t.T:  # two may be alike
-                alike = np.flatnonzero((root[:FEW] == column[:FEW, None]).all(0))
-                alike = (int(k) for k in alike if k not in at)
-                at.append(next(k for k in alike if (root[:, k] == column).all()))
+                alike = np.flatnonzero((root[:FEW] == column[:FEW, None]).all(0)).tolist()
+                at.append(next(k for k in alike if k not in at and (root[:, k] == column).all()))
             left = cho_solve((np.asarray(factor.lower), True), np.eye(root.shape[1])[:, at])
             solved, covariance = factor.base.whiten_transpose(factor.v @ left), left[at]
         else:
@@ -471,14 +470,6 @@ def tie(
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
     drawn, evidence = z + draws.reshape(-1, n_channels, n), float(-0.5 * (quadratic + log_dets))
     return Tied(z, half, white, blocks, drawn, evidence)
-
-
-def from_others(
-    mean: Vector, covariance: Square, tied_mean: Vector, tied_covariance: Square
-) -> tuple[Square, Vector]:
-    """Q and q of one channel about E', from its own posterior and the one given all data."""
-    inverse = np.linalg.inv(covariance)
-    return np.linalg.inv(tied_covariance) - inverse, inverse @ (tied_mean - mean)
 
 
 def information_given(

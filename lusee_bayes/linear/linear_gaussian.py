@@ -527,10 +527,6 @@ class Whitened(Form):
         """Compute W u."""
         return self.whitened @ u
 
-    def pulled(self, white: DataVector) -> Float[Array, " white"]:
-        """Compute W^T of white data."""
-        return self.whitened.T @ white
-
     def condition(self, data: DataVector) -> Solution:
         require_array("the data", data, (self.model.n_data,))
         data = jnp.asarray(data)
@@ -561,9 +557,6 @@ class InMap(Whitened):
 
     def seen(self, u):
         return self.whitened @ self.model.prior.colour(u)
-
-    def pulled(self, white):
-        return self.model.prior.colour_columns((self.whitened.T @ white)[None])[0]
 
 
 class InData(Whitened):
@@ -603,7 +596,8 @@ def _log_det_in_span_jvp(primals, tangents):
 def _newton(solver: Whitened, white: Array, u: Array) -> tuple[Array, Array]:
     """u plus Lambda^-1 (W^T (w - W u) - u), and the length of that step in standard deviations."""
     lower, basis = solver.lower, solver.basis
-    gradient = solver.pulled(white - solver.seen(u)) - u
+    (pulled,) = jax.linear_transpose(solver.seen, u)(white - solver.seen(u))
+    gradient = pulled - u
     projected = gradient if basis is None else basis.T @ gradient
     half = solve_lower(lower, projected[:, None], transpose=False)
     step = solve_lower(lower, half, transpose=True)[:, 0]

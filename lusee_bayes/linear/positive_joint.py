@@ -377,15 +377,14 @@ def positive_sky(
     slope = _slope(skies, channel, exponent)
     covariance = beside.whole_covariance(symmetric_product(slope @ joint_sky.covariance, slope.T))
     shape = len(draws), len(beside.patterns)
-    middle = _whole(skies, channel, joint_sky.mean)[None]
-    mean = beside.whole_skies(middle, np.zeros((1, shape[1])))[0]
     flux_key = jax.random.fold_in(jax.random.fold_in(key, channel), 1)
     z = np.asarray(jax.random.normal(flux_key, shape, dtype=jnp.float64))
-    drawn = np.empty((len(draws), len(mean)))
-    for first in range(0, len(draws), CHUNK):
-        chunk = slice(first, first + CHUNK)
-        drawn[chunk] = _whole(skies, channel, joint_sky.draws[chunk])
-    return joint.ChannelSky(mean, covariance, beside.whole_skies(drawn, z))
+    # for the mean and every draw
+    found = np.concatenate([joint_sky.mean[None], joint_sky.draws])
+    chunks = [found[first : first + CHUNK] for first in range(0, len(found), CHUNK)]
+    diffuse = np.concatenate([_whole(skies, channel, chunk) for chunk in chunks])
+    whole = beside.whole_skies(diffuse, np.pad(z, ((1, 0), (0, 0))))
+    return joint.ChannelSky(whole[0], covariance, whole[1:])
 
 
 # highest ell of the maps from which laws are learned

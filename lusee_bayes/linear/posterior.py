@@ -279,12 +279,9 @@ def _rounding(posterior: Posterior, variance: Float[Array, " white"]) -> Float[A
 @compiled
 def _std(posterior: Posterior) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
     """Standard deviations of m, and :func:`_rounding` in those of u."""
-    xp, basis = namespace(posterior), posterior.basis
-    eye = xp.eye(posterior.prior.size)
+    xp = namespace(posterior)
     # the rows of H, where H^T H is the covariance of u
-    rows = solve_lower(posterior.lower, eye if basis is None else basis.T, transpose=False)
-    if basis is not None:
-        rows = xp.concatenate([rows, eye - basis @ basis.T])
+    rows = _white_times_root(posterior, xp.eye(posterior.prior.size))
     rounding = _rounding(posterior, (rows**2).sum(0))
     return xp.sqrt((posterior.prior.colour(rows) ** 2).sum(0)), rounding
 
@@ -304,12 +301,15 @@ def _covariance(posterior: Posterior) -> tuple[Float[Array, "unknowns unknowns"]
 
 @compiled
 def _times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array, "n unknowns"]:
-    """R z = G (L^-T z), or with a basis: z outside its span, L^-T Q^T z inside."""
+    """R z = G (L^-T z)."""
+    return posterior.prior.colour(_white_times_root(posterior, z))
+
+
+def _white_times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array, "n white"]:
+    """L^-T z, or with a basis: z outside its span, L^-T Q^T z inside."""
     inside = z if posterior.basis is None else z @ posterior.basis
     drawn = solve_lower(posterior.lower, inside.T, transpose=True).T
-    if posterior.basis is not None:
-        drawn = z + (drawn - inside) @ posterior.basis.T
-    return posterior.prior.colour(drawn)
+    return drawn if posterior.basis is None else z + (drawn - inside) @ posterior.basis.T
 
 
 @compiled
@@ -318,9 +318,7 @@ def _whiten(posterior: Posterior, skies: Float[Array, "n unknowns"]) -> Float[Ar
     u = posterior.prior.whiten(skies) - posterior.white_mean[None]
     inside = u if posterior.basis is None else u @ posterior.basis
     white = inside @ namespace(posterior).tril(posterior.lower)
-    if posterior.basis is None:
-        return white
-    return u + (white - inside) @ posterior.basis.T
+    return white if posterior.basis is None else u + (white - inside) @ posterior.basis.T
 
 
 def pixel_std(covariance: ModesMatrix, nside: int) -> Pixels:

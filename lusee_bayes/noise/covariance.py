@@ -442,11 +442,6 @@ class KnownFactor(Covariance):
     covariance: Covariance
     root: Factor
 
-    @classmethod
-    def of(cls, noise: Covariance) -> KnownFactor:
-        """Factorise N; InputError if it is not positive definite."""
-        return cls(noise, noise.factor())
-
     @property
     def size(self) -> int:
         return self.covariance.size

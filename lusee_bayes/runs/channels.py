@@ -56,7 +56,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
-from lusee_bayes.linear.amplitudes import Tied, from_others, information_given, kernel, tie
+from lusee_bayes.linear.amplitudes import Tied, information_given, kernel, tie
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
@@ -436,8 +436,9 @@ class ChannelAlone:
         # constraints from the other channels on this one's unknowns
         n = len(amplitudes.mean)
         precision, vector, expansion = np.zeros((n, n)), np.zeros(n), np.zeros(n)
-        precision[np.ix_(shared, shared)], vector[shared] = from_others(e, v, mean, covariance)
-        expansion[shared] = mean
+        inverse = np.linalg.inv(v)
+        precision[np.ix_(shared, shared)] = np.linalg.inv(covariance) - inverse
+        vector[shared], expansion[shared] = inverse @ (mean - e), mean
         unknowns = replace(self.unknowns, amplitudes=amplitudes.given(precision, vector, expansion))
         sky_share = np.linalg.solve(v, (np.linalg.solve(v, v - inner)).T)
         gained = np.linalg.slogdet(np.eye(len(shared)) + (covariance - v) @ sky_share)[1]

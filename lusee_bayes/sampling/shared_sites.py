@@ -106,14 +106,13 @@ class SharedSites:
     frequencies_mhz: Mapping[str, float]
     octaves: Mapping[str, float]
 
-    def __call__(self, channels: Mapping[str, dict], data: Mapping[str, Array] | None = None):
-        """Sample or observe all channels; return the program's result for each."""
+    def __call__(self, channels: Mapping[str, dict], data: Mapping[str, Array]):
+        """Sample all channels given their data; return the program's result for each."""
         site_values: dict[str, dict[str, Any]] = {}
         returned = []
         for channel, arguments in channels.items():
             with _Channel(self, channel, site_values):
-                observed = None if data is None else data[channel]
-                returned.append(self.program(**arguments, data=observed))
+                returned.append(self.program(**arguments, data=data[channel]))
         return returned
 
 

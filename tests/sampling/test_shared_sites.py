@@ -62,7 +62,7 @@ def test_what_is_nearly_the_same_has_no_site_of_its_own():
     """Over 1e6 octaves the variance that is left is below rounding: one site, scaled."""
     shared = SharedSites(program, FREQUENCIES, {"smooth": 1e6})
     with numpyro_promotion():
-        trace = handlers.trace(handlers.seed(shared, jax.random.key(0))).get_trace(CHANNELS)
+        trace = handlers.trace(handlers.seed(shared, jax.random.key(0))).get_trace(CHANNELS, DATA)
     z = [float(trace[f"{c}/smooth"]["value"] / m - 1.0) / 0.1 for c, m in MEANS.items()]
     kinds = [trace[f"{name}/smooth"]["type"] for name in FREQUENCIES]
     assert kinds == ["sample", "deterministic", "deterministic"]
