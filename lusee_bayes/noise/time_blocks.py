@@ -159,14 +159,14 @@ class TimeBandedFactor(Factor):
     inverse: Float[Array, "blocks rows rows"]
     layout: DataLayout
 
-    def _swept(self, step: Callable, across: Array, x: Columns, reverse: bool = False) -> Columns:
+    def _swept(self, step: Callable, across: Array, x: Columns) -> Columns:
         """Apply ``step`` to every block row of x, with its carry and L before and in the row."""
         (n, rows, window), layout = self.left.shape, self.layout
         grid = layout.by_time(x)
         flat = grid.reshape(layout.n_times * layout.n_products, -1)
         padded = jnp.pad(flat, ((0, n * rows - len(flat)), (0, 0)))
         parts = (self.left, across, padded.reshape(n, rows, -1))
-        _, swept = jax.lax.scan(step, jnp.zeros((window, flat.shape[1])), parts, reverse=reverse)
+        _, swept = jax.lax.scan(step, jnp.zeros((window, flat.shape[1])), parts)
         swept = swept.reshape(n * rows, -1)[: len(flat)]
         return layout.from_times(swept.reshape(grid.shape), x.shape)
 
@@ -181,13 +181,8 @@ class TimeBandedFactor(Factor):
 
     @eqx.filter_jit
     def whiten_transpose(self, x):
-        def step(pending, row):
-            left, inverse, block = row
-            solved = inverse.T @ (block - pending[-len(block) :])
-            pending = jnp.concatenate([jnp.zeros_like(block), pending[: -len(block)]])
-            return pending + left.T @ solved, solved
-
-        return self._swept(step, self.inverse, x, reverse=True)
+        _, transposed = jax.vjp(self.whiten, x)  # whitening is linear
+        return transposed(x)[0]
 
     @eqx.filter_jit
     def colour(self, z):

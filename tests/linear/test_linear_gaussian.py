@@ -234,8 +234,8 @@ def test_refinement_is_needed_and_reported():
     model, d, exact = graded(60, 1e6)
     solver = model.factorise(InMap)
     lower = np.tril(np.asarray(solver.lower))
-    white = np.asarray(d) / np.sqrt(np.asarray(model.noise.variance))
-    u = np.linalg.solve(lower.T, np.linalg.solve(lower, np.asarray(solver.pulled(white))))
+    pulled = model.prior.colour(solver.whitened.T @ (d / np.sqrt(model.noise.variance)))
+    u = np.linalg.solve(lower.T, np.linalg.solve(lower, np.asarray(pulled)))
     unrefined = u * np.sqrt(per_mode(np.asarray(model.prior.spectrum)))
     assert np.abs((unrefined - exact.mean) / exact.std).max() > PROMISED
     assert 0.0 <= float(model.condition(d, InMap).posterior.refinement) <= CONVERGENCE
