@@ -104,9 +104,7 @@ class Posterior(Described, eqx.Module):
         InputError
             If rounding in the map-space form makes one of them wrong by more than ``PRECISION``.
         """
-        std, rounding = _std(self)
-        _require_precise(rounding)
-        return std
+        return _checked(*_std(self))
 
     def std_of(self, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
         """Compute the standard deviation of linear combinations of the unknowns.
@@ -137,9 +135,7 @@ class Posterior(Described, eqx.Module):
         InputError
             As :meth:`std`.
         """
-        covariance, rounding = _covariance(self)
-        _require_precise(rounding)
-        return covariance
+        return _checked(*_covariance(self))
 
     def root(self) -> Float[Array, "unknowns white"]:
         """Compute R with C = R R^T: a draw is mean + R z, z ~ N(0, 1).
@@ -252,13 +248,15 @@ class Posterior(Described, eqx.Module):
         return xp.asarray(xp.log(xp.diagonal(self.lower)).sum() / np.log(2.0))
 
 
-def _require_precise(rounding: Float[Array, ""]) -> None:
+def _checked(errors: Float[Array, "..."], rounding: Float[Array, ""]) -> Float[Array, "..."]:
+    """Standard deviations or covariance, unless rounding makes them wrong by too much."""
     if not is_traced(rounding) and float(rounding) > PRECISION:
         raise InputError(
             "standard deviations of the map-space form would have a relative error of "
             f"{rounding:.1g} (accepted: {PRECISION:g}): the data are too precise for the normal "
             "equations; use form=InData"
         )
+    return errors
 
 
 def _rounding(posterior: Posterior, variance: Float[Array, " white"]) -> Float[Array, ""]:
