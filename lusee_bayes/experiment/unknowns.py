@@ -299,8 +299,9 @@ class Unknowns:
         return [tied.names.index(name) for name in self.shared_names]
 
     def _of(self, tied: Tied, number: int) -> Shared:
-        root = tied.prior_root[number, self.among(tied)]
-        return self.amplitudes.shared(self.shared, self.expected[self.shared], root)
+        k, given, root = self.shared, self.amplitudes, tied.prior_root[number, self.among(tied)]
+        covariance = given.covariance[np.ix_(k, k)]
+        return Shared(k, given.mean[k] + self.expected[k], given.pull[k], covariance, root)
 
     def whole(self, information: Information, tied: Tied, number: int) -> Information:
         """The data's information about the sky together with the shared unknowns.

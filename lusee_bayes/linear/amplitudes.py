@@ -171,23 +171,6 @@ class AmplitudesOfSky:
         least = self.mean - self.pull @ (mean - self.reference)
         return Amplitudes(least, self.covariance - self.pull @ with_sky, with_sky)
 
-    def shared(
-        self, k: Int[np.ndarray, " shared"], expected: Vector, root: Float[np.ndarray, "shared w"]
-    ) -> Shared:
-        """Select the shared amplitudes, e + x = R w.
-
-        Parameters
-        ----------
-        k : (shared,) array
-            Their indices.
-        expected : (shared,) array
-            Their e.
-        root : (shared, w) array
-            R.
-        """
-        covariance = self.covariance[np.ix_(k, k)]
-        return Shared(k, self.mean[k] + expected, self.pull[k], covariance, root)
-
     def with_shared(self, shared: Shared, mean: Vector, covariance: Square) -> Amplitudes:
         """Integrate out a sky and w, N(mean, covariance) given any additional data.
 
@@ -221,6 +204,42 @@ class AmplitudesOfSky:
         covariance = kept @ self.covariance
         mean = self.mean + covariance @ (vector - precision @ (self.mean - expected))
         return AmplitudesOfSky(mean, kept @ self.pull, covariance, self.reference)
+
+    def information_given(
+        self, information: Information, precision: Square, vector: Vector, expected: Vector
+    ) -> Information:
+        """Information about the sky, with the other knowledge of :meth:`given`.
+
+        ::
+
+            M + P^T W P,    v + P^T (1 + Q D)^-1 (Q x - q),    W = (1 + Q D)^-1 Q,
+
+        with x = ``mean`` - t, D = ``covariance`` and P = ``pull``. If t is near the amplitudes,
+        large Q cause no small differences of large numbers.
+
+        Parameters
+        ----------
+        information : Information
+            With amplitudes N(0, 1), about the same reference sky.
+        precision, vector, expected : array
+            As for :meth:`given`.
+        """
+        off, pull, inner = self.mean - expected, self.pull, self.covariance
+        one, beyond = np.eye(len(off)), vector - expected
+        mixed = one + precision @ inner
+        gradient = np.linalg.solve(mixed, vector - precision @ off)
+        weight = np.linalg.solve(mixed, precision)
+        least = off + inner @ gradient
+        misfit = gradient @ inner @ gradient + least @ (precision @ least - 2.0 * vector)
+        misfit += beyond @ np.linalg.solve(one + precision, beyond) - expected @ expected
+        log_det = np.linalg.slogdet(mixed)[1] - np.linalg.slogdet(one + precision)[1]
+        return replace(
+            information,
+            matrix=information.matrix + pull.T @ (0.5 * (weight + weight.T)) @ pull,
+            vector=information.vector - pull.T @ gradient,
+            misfit=np.asarray(information.misfit + misfit),
+            log_det=np.asarray(information.log_det + log_det),
+        )
 
 
 @dataclass(frozen=True)
@@ -470,48 +489,3 @@ def tie(
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
     drawn, evidence = z + draws.reshape(-1, n_channels, n), float(-0.5 * (quadratic + log_dets))
     return Tied(z, half, white, blocks, drawn, evidence)
-
-
-def information_given(
-    information: Information,
-    amplitudes: AmplitudesOfSky,
-    precision: Square,
-    vector: Vector,
-    expected: Vector,
-) -> Information:
-    """Information about the sky, with amplitudes N(0, 1) times exp(-x^T Q x / 2 + q^T x).
-
-    ::
-
-        M + P^T W P,    v + P^T (1 + Q D)^-1 (Q x - q),    W = (1 + Q D)^-1 Q,
-
-    with x = ``amplitudes.mean`` - t, D = ``amplitudes.covariance`` and P = ``amplitudes.pull``. If
-    t is near the amplitudes, large Q cause no small differences of large numbers.
-
-    Parameters
-    ----------
-    information : Information
-        With amplitudes N(0, 1).
-    amplitudes : AmplitudesOfSky
-        About the same reference sky.
-    precision : (n, n) array
-        Q.
-    vector, expected : (n,) array
-        q and t.
-    """
-    off, pull, inner = amplitudes.mean - expected, amplitudes.pull, amplitudes.covariance
-    one, beyond = np.eye(len(off)), vector - expected
-    mixed = one + precision @ inner
-    gradient = np.linalg.solve(mixed, vector - precision @ off)
-    weight = np.linalg.solve(mixed, precision)
-    least = off + inner @ gradient
-    misfit = gradient @ inner @ gradient + least @ (precision @ least - 2.0 * vector)
-    misfit += beyond @ np.linalg.solve(one + precision, beyond) - expected @ expected
-    log_det = np.linalg.slogdet(mixed)[1] - np.linalg.slogdet(one + precision)[1]
-    return replace(
-        information,
-        matrix=information.matrix + pull.T @ (0.5 * (weight + weight.T)) @ pull,
-        vector=information.vector - pull.T @ gradient,
-        misfit=np.asarray(information.misfit + misfit),
-        log_det=np.asarray(information.log_det + log_det),
-    )

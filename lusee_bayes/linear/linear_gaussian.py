@@ -261,7 +261,7 @@ class Solution(Described):
     factor : Factor
         L of N = L L^T.
     kept_information : Information or None
-        :attr:`information`, if the posterior was computed from it.
+        :attr:`information` without the excess, if the posterior was computed from it.
     excess : float
         Excess of chi^2 if prior means of unknowns in N are shifted, to make up for volume.
     """
@@ -279,9 +279,10 @@ class Solution(Described):
     @cached_property
     def information(self) -> Information:
         """ln p(d | m) as a function of the sky; only its reference depends on the prior."""
-        if self.kept_information is not None:
-            return self.kept_information
-        return FromInformation.of(self.model).condition(self.data).less(self.excess).information
+        kept = self.kept_information
+        if kept is None:
+            kept = FromInformation.of(self.model).condition(self.data).kept_information
+        return replace(kept, misfit=np.asarray(kept.misfit - self.excess))
 
     @property
     def matrix(self) -> ModesMatrix | None:
@@ -312,10 +313,8 @@ class Solution(Described):
     def less(self, excess: float) -> Solution:
         """The same, with chi^2 and -2 ln p(d) lower by a number."""
         evidence = np.asarray(self.posterior.log_evidence + excess / 2.0)
-        posterior, kept = replace(self.posterior, log_evidence=evidence), self.kept_information
-        if kept is not None:
-            kept = replace(kept, misfit=np.asarray(kept.misfit - excess))
-        return replace(self, posterior=posterior, kept_information=kept, excess=excess)
+        posterior = replace(self.posterior, log_evidence=evidence)
+        return replace(self, posterior=posterior, excess=excess)
 
     def under(self, prior: Prior) -> Solution:
         """Solve for the same data under another prior; A^T N^-1 A is not computed again.

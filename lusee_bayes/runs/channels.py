@@ -56,7 +56,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
-from lusee_bayes.linear.amplitudes import Tied, information_given, kernel, tie
+from lusee_bayes.linear.amplitudes import Tied, kernel, tie
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
@@ -439,11 +439,12 @@ class ChannelAlone:
         inverse = np.linalg.inv(v)
         precision[np.ix_(shared, shared)] = np.linalg.inv(covariance) - inverse
         vector[shared], expansion[shared] = inverse @ (mean - e), mean
-        unknowns = replace(self.unknowns, amplitudes=amplitudes.given(precision, vector, expansion))
+        others = precision, vector, expansion
+        unknowns = replace(self.unknowns, amplitudes=amplitudes.given(*others))
         sky_share = np.linalg.solve(v, (np.linalg.solve(v, v - inner)).T)
         gained = np.linalg.slogdet(np.eye(len(shared)) + (covariance - v) @ sky_share)[1]
         bits = self.figures["information_bits"] - 0.5 * gained / np.log(2.0)
-        information = information_given(self.information, amplitudes, precision, vector, expansion)
+        information = amplitudes.information_given(self.information, *others)
         drawn, compared = np.split(deviations, [scenario.output.draws])
         skies = moved + drawn
         return channel_result(
