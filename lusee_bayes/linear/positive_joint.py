@@ -231,7 +231,7 @@ def find_joint_mode(
     last = np.zeros_like(laws.parameters)
     for rounds in range(MAX_ROUNDS):
         prior = laws.prior(skies)
-        posterior, mean, arrays = _linear_round(skies, channels, prior, point.exponents, learn)
+        posterior, mean, arrays = _linear_round(skies, channels, prior, point, learn)
         energy = point.energy(prior)
         moved = np.sqrt(max(energy - mean.energy(prior), 0.0))
         report(rounds, f"{moved:.2g} sigma")
@@ -261,51 +261,37 @@ def _chi2(skies: PositiveSkies, channels: Channels, exponents: Exponents) -> flo
 
 
 def _linear_round(
-    skies: PositiveSkies,
-    channels: Channels,
-    prior: SpectralPrior,
-    exponents: Exponents,
-    learn: bool,
+    skies: PositiveSkies, channels: Channels, prior: SpectralPrior, point: _Point, learn: bool
 ) -> tuple[Posterior, _Point, Arrays]:
-    """Posterior of skies that are linear about exponents, its mean, and every channel there."""
+    """Posterior of skies that are linear about a point, its mean, and every channel there."""
 
     def relative(channel: int, information: Information) -> Information:
-        return linearised(skies, channel, information, exponents[channel])
+        return linearised(skies, channel, information, point.exponents[channel])
 
-    information = channels.summed(prior, exponents, relative)
+    information = channels.summed(prior, point.exponents, relative)
     posterior = joint.component_posterior(information, prior)
     mean = np.asarray(posterior.mean)
     spread = joint.paired(posterior.covariance(), prior) if learn else None
 
     def judged(channel: int, information: Information) -> Arrays:
-        return _judged(prior, channel, relative(channel, information), mean, spread)
+        """Exponent and chi^2 of a channel at the mean, and its residual's power."""
+        information, none = relative(channel, information), np.zeros((0, len(mean)))
+        sky = joint.channel_sky(prior, channel, information, mean, None, none, jax.random.key(0))
+        found = {"exponent": sky.mean, "chi2": information.chi2(sky.mean)}
+        if spread is None:
+            return found
+        root = prior.residual_root(channel)
+        inverse = inverse_from_cholesky(joint.residual_lower(information, root))
+        common = joint.common_covariance(prior, channel, spread)
+        # variance of the residual given the common part, and of its part that follows it
+        pull = (inverse * root[None]) @ information.matrix[: len(root)]
+        variance = np.diagonal(inverse) + np.einsum("ij,ij->i", pull @ common, pull)
+        white = ((sky.mean - joint.common_of(prior, channel, mean))[: len(root)]) / root
+        return {**found, "power": sum_over_m(white**2), "known": sum_over_m(1.0 - variance)}
 
     parts = channels.each(judged)
     arrays = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
     return posterior, _Point(mean, arrays["exponent"], float(arrays["chi2"].sum())), arrays
-
-
-def _judged(
-    prior: SpectralPrior,
-    channel: int,
-    information: Information,
-    mean: Vector,
-    spread: joint.Blocks | None,
-) -> Arrays:
-    """Exponent and chi^2 of a channel at the mean of a linear round, and its residual's power."""
-    none = np.zeros((0, len(mean)))
-    sky = joint.channel_sky(prior, channel, information, mean, None, none, jax.random.key(0))
-    judged = {"exponent": sky.mean, "chi2": information.chi2(sky.mean)}
-    if spread is None:
-        return judged
-    root = prior.residual_root(channel)
-    inverse = inverse_from_cholesky(joint.residual_lower(information, root))
-    common = joint.common_covariance(prior, channel, spread)
-    # variance of the residual given the common part, and of its part that follows the common one
-    pull = (inverse * root[None]) @ information.matrix[: len(root)]
-    variance = np.diagonal(inverse) + np.einsum("ij,ij->i", pull @ common, pull)
-    white = ((sky.mean - joint.common_of(prior, channel, mean))[: len(root)]) / root
-    return {**judged, "power": sum_over_m(white**2), "known": sum_over_m(1.0 - variance)}
 
 
 def _powers(posterior: Posterior, prior: SpectralPrior, arrays: Arrays) -> tuple[OfLaws, OfLaws]:
