@@ -56,9 +56,8 @@ def test_turns_find_gain_and_sky(off, width):
 def test_every_turn_is_taken_where_the_coordinates_are_the_posteriors():
     """All chains at once, as programs run that predict the data; quarter turns forget."""
     program, arguments = lb.load_program("sky"), CASE.arguments()
-    noise = arguments.pop("noise")
-    factorised = KnownFactor(noise, noise.factor())
-    arguments |= {"fixed_noise": factorised, "data": jnp.asarray(CASE.data)}
+    noise = KnownFactor(arguments["noise"], arguments.pop("noise").factor())
+    arguments |= {"fixed_noise": noise, "data": jnp.asarray(CASE.data)}
     model = lb.LinearGaussian(arguments["coupling"], arguments["prior"], noise)
     known = model.condition(arguments["data"], InData).posterior
     sampler = lb.Sampler(draws=500, warmup=20, algorithm="crank-nicolson", seed=1)
