@@ -272,14 +272,9 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     Raises
     ------
     InputError
-        If a clock is unknown or contradicts another, sessions overlap or have different sites, or
-        instants are to be averaged.
+        If a clock is unknown or contradicts another, sessions overlap or have different sites, and
+        as :func:`.bins_of`.
     """
-    if recipe.timestamp == "instant" and recipe.average_s is not None:
-        raise InputError(
-            "the times of the spectra are declared instants (observation.timestamp=instant), which "
-            "cannot be averaged; remove observation.average_s, or set observation.timestamp=middle"
-        )
     timed = [(s, clock_of(s.path, s.clock, recipe.clock, s.raw_s).utc(s.raw_s)) for s in sessions]
     timed.sort(key=lambda one: one[1][0].jd)
     for (a, times_a), (b, times_b) in pairwise(timed):
@@ -308,7 +303,7 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
         observation = Observation(lon, lat, times, state, angles, longest, windows=windows)
     bin_of = np.arange(len(state))
     if recipe.average_s is not None:
-        bin_of = bins_of(observation, windows.bounds_s, recipe.average_s)
+        bin_of = bins_of(observation, recipe.average_s)
     session = np.repeat(np.arange(len(ordered)), [s.n_rows for s in ordered])
     row = np.concatenate([np.arange(s.n_rows) for s in ordered])
     return Timeline(ordered, observation, session, row, bin_of)

@@ -20,7 +20,6 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from lusee_bayes.core.arrays import Rows
 from lusee_bayes.core.engine import in_threads
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import xarray
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
@@ -58,11 +57,6 @@ def reduce_sessions(
     """
     stages = stages or Stages()
     line = timeline(sessions, recipe)
-    if recipe.average_s is not None and recipe.average_s < line.observation.step_s:
-        raise InputError(
-            f"observation.average_s is {recipe.average_s:g} s, shorter than a spectrum "
-            f"({line.observation.step_s:g} s); use a longer one, or none"
-        )
     level = np.concatenate([s.level for s in line.sessions])
     first = np.searchsorted(line.bin_of, np.arange(line.bin_of[-1] + 1))
     live_s, times = line.observation.live_s, line.observation.times

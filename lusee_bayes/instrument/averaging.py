@@ -34,6 +34,7 @@ from math import factorial, lgamma
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
 from lusee_bayes.core.arrays import Array, GridFlags, TimeFlags, Times
@@ -48,8 +49,8 @@ from lusee_bayes.instrument.visibilities import Visibilities
 # numbers of samples; ex and ey; u_j and G_j of the module's equations
 Samples, Tilts = Int[np.ndarray, " samples"], Float[np.ndarray, "nodes 2"]
 Functions = Float[np.ndarray, "times functions"]
-Series = Float[np.ndarray, "moments columns"]
-BinFlags, Bounds = Bool[np.ndarray, "products bins"], Float[np.ndarray, "times 2"]
+Series, Importance = Float[np.ndarray, "moments columns"], Float[np.ndarray, "powers orders"]
+BinFlags = Bool[np.ndarray, "products bins"]
 
 # error of any sample relative to its visibility, if the sky that a beam sees falls as ell to this
 # power: less than 1e-6 of the radiometer noise in the fiducial case
@@ -126,12 +127,11 @@ def windowed(
     weighted = weight[:, None] * e
     of_power = [weighted * scaled[:, None] ** k for k in range(n_moments)]
     moments = np.stack([np.add.reduceat(x, first, axis=0) for x in of_power], axis=2)
-    moments = moments.reshape(len(first), -1)
+    moments, importance = moments.reshape(len(first), -1), _importance(powers, lmax)
     # small matrices: several threads would wait for one another
     with threadpool_limits(1, "blas"):
-        functions, factors = _fewest(moments, _series(powers, n_moments, largest, lmax))
-    weights = _importance(powers, lmax)
-    factors = factors.reshape(len(factors), len(powers), lmax + 1, 2) / weights[..., None]
+        functions, factors = _fewest(moments, _series(importance, n_moments, largest))
+    factors = factors.reshape(-1, *importance.shape, 2) / importance[..., None]
     return azimuth[first] + mean, functions, factors
 
 
@@ -144,38 +144,33 @@ def terms_of_exponential(size: float, tolerance: float) -> int:
     return n
 
 
-def _importance(powers: list[tuple[int, int]], lmax: int) -> Float[np.ndarray, "powers orders"]:
+def _importance(powers: list[tuple[int, int]], lmax: int) -> Importance:
     """Weight of each power of the tilt in the harmonics of each order."""
     ell = np.arange(1.0, max(lmax, 1) + 1.0)
     above = [ell[ell >= max(m, 1)] for m in range(lmax + 1)]
     return np.array([[(x ** (a + b + FALLING)).sum() for x in above] for a, b in powers])
 
 
-def _series(powers: list[tuple[int, int]], n_moments: int, largest: float, lmax: int) -> Series:
+def _series(importance: Importance, n_moments: int, largest: float) -> Series:
     """(i m)^k / k! for scaled moments, real and imaginary parts, weighted by their importance."""
-    angle = 1j * np.arange(lmax + 1.0) * largest
+    angle = 1j * np.arange(importance.shape[1]) * largest
     terms = np.array([angle**k / factorial(k) for k in range(n_moments)])
     parts = np.stack([terms.real, terms.imag], axis=-1)
-    weighted = _importance(powers, lmax)[:, None, :, None] * parts[None]
-    n = len(powers)
-    series = np.zeros((n, n_moments, n, lmax + 1, 2))
-    series[np.arange(n), :, np.arange(n)] = weighted
-    return series.reshape(n * n_moments, -1)
+    blocks = importance[:, None, :, None] * parts
+    return block_diag(*blocks.reshape(len(blocks), n_moments, -1))
 
 
 def _fewest(moments: Float[np.ndarray, "times moments"], series: Series) -> tuple[Functions, Array]:
     """Functions u and factors G with u G = moments x series at every time, to ``TOLERANCE``."""
     q, r = np.linalg.qr(moments)
     across, left = np.linalg.qr(series.T)
-    u, s, vt = np.linalg.svd(r @ left.T)
-    n = min(u.shape[0], vt.shape[0])
-    u, vt = u[:, :n], vt[:n] @ across.T
+    u, s, vt = np.linalg.svd(r @ left.T, full_matrices=False)
     contributions = (q @ u) * s
     size = np.sqrt((contributions**2).sum(1).max())
     # remainder of each sample without the last functions
     missing = np.sqrt(np.cumsum((contributions**2)[:, ::-1], axis=1)[:, ::-1].max(0))
     keep = max(1, int((missing > TOLERANCE * size).sum()))
-    return contributions[:, :keep], vt[:keep]
+    return contributions[:, :keep], vt[:keep] @ across.T
 
 
 # the sky turns once in 27 days: a longer mean is a mistake, for instance in units
@@ -210,19 +205,8 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
         data remain.
     """
     require_positive("the time to average over, in seconds,", to_s)
-    observation, windows = data.observation, data.observation.windows
-    if windows is None:
-        raise InputError(
-            "the samples are instants, which cannot be averaged; give samples with windows "
-            "(observation.window=mean in a simulation, observation.timestamp for other data)"
-        )
-    if to_s < observation.step_s - ROUNDING_S:
-        raise InputError(
-            f"the averaging time of {to_s:g} s is shorter than the samples ({observation.step_s:g} "
-            "s); give at least that, or do not average"
-        )
-    live_s = windows.live_per_sample_s
-    bin_of = bins_of(observation, windows.bounds_s, to_s)
+    observation, live_s = data.observation, data.observation.live_s
+    bin_of = bins_of(observation, to_s)
     kept, used = by_the_rule(np.asarray(data.layout.present), bin_of, live_s)
     if not used.any():
         raise InputError(
@@ -245,29 +229,38 @@ def product_live_s(data: Visibilities) -> float:
     return float(data.observation.live_s[data.layout.time].sum())
 
 
-def bins_of(observation: Observation, bounds_s: Bounds, to_s: float) -> Samples:
+def bins_of(observation: Observation, to_s: float) -> Samples:
     """Return the bin number of every sample.
 
     Parameters
     ----------
     observation : Observation
-    bounds_s : (times, 2) array
-        Start and end of every sample, in seconds from its time.
     to_s : float
         Length of the bins, in seconds.
 
     Raises
     ------
     InputError
-        For bins of more than 30 days.
+        For instants, and for bins that are shorter than the samples or longer than 30 days.
     """
+    if observation.windows is None:
+        raise InputError(
+            "the samples are instants, which cannot be averaged; give samples with windows "
+            "(observation.window=mean in a simulation, observation.timestamp=start, middle or end "
+            "for other data), or remove observation.average_s"
+        )
+    if to_s < observation.step_s - ROUNDING_S:
+        raise InputError(
+            f"the averaging time of {to_s:g} s is shorter than the samples ({observation.step_s:g} "
+            "s); give at least that, or do not average"
+        )
     if to_s > LONGEST_S:
         raise InputError(
             f"the averaging time is {to_s:g} s, i.e. {to_s / 86400.0:g} days; give at most "
             f"{LONGEST_S / 86400.0:g} days, one rotation of the Moon"
         )
     seconds = seconds_from(observation.times[0], observation.times)
-    start, end = seconds + bounds_s[:, 0], seconds + bounds_s[:, 1]
+    start, end = seconds + observation.windows.bounds_s.T
     origin = start[np.searchsorted(observation.run, observation.run)]
     place = np.floor((start - origin + ROUNDING_S) / to_s)
     bin_of, begins = np.zeros(len(start), dtype=np.int64), 0
