@@ -54,59 +54,17 @@ MUCH = 0.2
 in_volts = partial(quantity, "V2 Hz-1", packed=True)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StoredObservation:
-    """An observation in the terms of a file: times, windows of one piece each, and place.
-
-    Attributes are those of :class:`.Observation` and :class:`.Windows`; there are no windows for
-    instants.
-    """
-
-    jd1: Float[np.ndarray, " spectrum"] = quantity("d", "Julian date, UTC", checks={})
-    jd2: Float[np.ndarray, " spectrum"] = quantity("d", "its second part", checks={})
-    run: Int[np.ndarray, " spectrum"] = quantity("1", checks={"low": 0.0})
-    window_start_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={})
-    window_end_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={})
-    live_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={"low": 0.0})
-    turntable_deg: Float[np.ndarray, " state"] = quantity("degree", checks={})
-    lon_deg: float
-    lat_deg: float
-    step_s: float
-
-    @classmethod
-    def of(cls, observation: Observation) -> StoredObservation:
-        """Return the terms of an observation."""
-        windows = observation.windows
-        return cls(
-            jd1=observation.times.jd1,
-            jd2=observation.times.jd2,
-            run=np.asarray(observation.run),
-            window_start_s=None if windows is None else windows.start_s,
-            window_end_s=None if windows is None else windows.end_s,
-            live_s=None if windows is None else windows.live_s,
-            turntable_deg=np.array(observation.turntable_deg),
-            **{name: getattr(observation, name) for name in ("lon_deg", "lat_deg", "step_s")},
-        )
-
-    @cached_property
-    def observation(self) -> Observation:
-        """A sample for each spectrum; a run for each state of the spectrometer."""
-        windows = None
-        if self.window_start_s is not None and self.window_end_s is not None:
-            windows = Windows.whole(self.window_start_s, self.window_end_s, self.live_s)
-        place, times = (self.lon_deg, self.lat_deg), utc_of(self.jd1, self.jd2)
-        runs = self.run, tuple(self.turntable_deg.tolist()), self.step_s
-        return Observation(*place, times, *runs, windows=windows)
-
-
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
-class Reduced(Described, StoredObservation):
+class Reduced(Described):
     """Spectra in bands, averaged over time.
 
     Numbers are for bands, products and bins of time; flags are for spectra ("rows").
 
     Attributes
     ----------
+    jd1, jd2, run, window_start_s, window_end_s, live_s, turntable_deg, lon_deg, lat_deg, step_s
+        The observation's, in the terms of :class:`.Observation` and :class:`.Windows`, with windows
+        of one piece each; None for instants.
     frequencies_mhz : (bands,) array
     product : (products,) array of str
         Names of the package's products, in order.
@@ -150,6 +108,16 @@ class Reduced(Described, StoredObservation):
         How they were reduced, in words.
     """
 
+    jd1: Float[np.ndarray, " spectrum"] = quantity("d", "Julian date, UTC", checks={})
+    jd2: Float[np.ndarray, " spectrum"] = quantity("d", "its second part", checks={})
+    run: Int[np.ndarray, " spectrum"] = quantity("1", checks={"low": 0.0})
+    window_start_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={}, default=None)
+    window_end_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={}, default=None)
+    live_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={"low": 0.0}, default=None)
+    turntable_deg: Float[np.ndarray, " state"] = quantity("degree", checks={})
+    lon_deg: float
+    lat_deg: float
+    step_s: float
     frequencies_mhz: Float[np.ndarray, " frequency"] = quantity(
         "MHz", checks={"low": 0.0, "grows": True, "unit": "MHz"}, stored="frequency"
     )
@@ -185,6 +153,16 @@ class Reduced(Described, StoredObservation):
     gain_std: float | None
     sessions: tuple[dict[str, Any], ...]
     recipe: dict[str, str]
+
+    @cached_property
+    def observation(self) -> Observation:
+        """A sample for each spectrum; a run for each state of the spectrometer."""
+        windows = None
+        if self.window_start_s is not None and self.window_end_s is not None:
+            windows = Windows.whole(self.window_start_s, self.window_end_s, self.live_s)
+        place, times = (self.lon_deg, self.lat_deg), utc_of(self.jd1, self.jd2)
+        runs = self.run, tuple(self.turntable_deg.tolist()), self.step_s
+        return Observation(*place, times, *runs, windows=windows)
 
     def description(self) -> tuple[str, ...]:
         f = self.frequencies_mhz

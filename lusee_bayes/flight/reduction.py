@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Int
 
 from lusee_bayes.core.arrays import Rows
 from lusee_bayes.core.engine import in_threads
@@ -35,6 +34,11 @@ from lusee_bayes.instrument.times import seconds_from
 SLAB, PIECE = 128, 1024
 # gains of the ports, each with two components, in the bins of one state
 Curve = Float[np.ndarray, "ports 3 bins"]
+# numbers of a band by their names in Reduced, without the axis of bands: of some spectra, each of
+# which is a bin, or of the bins of a piece. Also "bend", the change of the autos by two further
+# powers of the frequency in standard deviations (ports, bins). "scatter" has a value for every span
+# of a few hours, "line_scatter" one for every slab
+Parts = dict[str, np.ndarray]
 
 
 def reduce_sessions(
@@ -73,17 +77,21 @@ def reduce_sessions(
                 in_threads(_slab(line, recipe, start, next(counts)), numbers)
                 for start in range(piece.start, piece.stop, SLAB)
             ]
-            spectra = [Parts.joined(band) for band in zip(*slabs, strict=True)]
+            spectra = [_joined(band) for band in zip(*slabs, strict=True)]
             seconds = seconds_from(times[piece.start], times[piece])
             of_piece = seconds, live_s[piece], line.bin_of[piece], recipe.section.false_alarm
             averages.append(in_threads(partial(_finish, *of_piece), spectra))
             done(piece.stop)
-    bands = [Parts.joined(band) for band in zip(*averages, strict=True)]
-    whole = {one.name: np.stack([getattr(x, one.name) for x in bands]) for one in fields(Parts)}
+    bands = [_joined(band) for band in zip(*averages, strict=True)]
+    whole = {name: np.stack([band[name] for band in bands]) for name in bands[0]}
     bend = xarray.DataArray(whole.pop("bend"), dims=("band", "port", "bin")).mean("bin")
     for name in ("scatter", "line_scatter"):
         parts = xarray.DataArray(whole[name], dims=("band", "part"))
         whole[name] = parts.median("part").values
+    window, windows = {}, line.observation.windows
+    if windows is not None:
+        window = {"window_start_s": windows.start_s, "window_end_s": windows.end_s}
+        window["live_s"] = windows.live_s
     names = line.sessions[0].telemetry
     telemetry = {n: np.concatenate([s.telemetry[n] for s in line.sessions]) for n in names}
     return reduced.Reduced(
@@ -101,42 +109,18 @@ def reduce_sessions(
         recipe=recipe.words(),
         curvature=np.abs(bend).max("port").values,
         **whole,
-        **vars(reduced.StoredObservation.of(line.observation)),
+        jd1=times.jd1,
+        jd2=times.jd2,
+        run=line.observation.run,
+        turntable_deg=np.array(line.observation.turntable_deg),
+        **{name: getattr(line.observation, name) for name in ("lon_deg", "lat_deg", "step_s")},
+        **window,
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Parts:
-    """Numbers of a band, for some spectra of which each is a bin, or for the bins of a piece.
-
-    Attributes
-    ----------
-    bend : (ports, bins) array
-        Change of the autos by two further powers of the frequency, in standard deviations.
-    scatter : (spans,) array
-        Scatter in time over the radiometer noise, for spans of a few hours; NaN if unknown.
-    line_scatter : (slabs,) array
-        Scatter of channels about a smooth spectrum over the radiometer noise.
-    reason, lines, values, before, n_averaged, gain, gain_slope
-        As in :class:`.Reduced`, without the axis of bands.
-    """
-
-    reason: UInt8[np.ndarray, " rows"]
-    lines: Float32[np.ndarray, " rows"]
-    values: Float[np.ndarray, "products bins"]
-    before: Float[np.ndarray, "products bins"]
-    n_averaged: Float[np.ndarray, " bins"]
-    gain: Float[np.ndarray, "ports bins"]
-    gain_slope: Float[np.ndarray, "ports components bins"]
-    bend: Float[np.ndarray, "ports bins"]
-    scatter: Float[np.ndarray, " spans"]
-    line_scatter: Float[np.ndarray, " slabs"]
-
-    @classmethod
-    def joined(cls, parts: Sequence[Parts]) -> Parts:
-        """Join parts in order of time."""
-        names = [one.name for one in fields(cls)]
-        return cls(**{n: np.concatenate([getattr(x, n) for x in parts], axis=-1) for n in names})
+def _joined(parts: Sequence[Parts]) -> Parts:
+    """Join numbers in order of time."""
+    return {name: np.concatenate([x[name] for x in parts], axis=-1) for name in parts[0]}
 
 
 def _pieces(line: Timeline) -> list[slice]:
@@ -260,18 +244,17 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
         middle = band.basis[:, 0] / len(band.basis)
         centre = np.einsum("rpk,k->pr", gain, middle)
         components = np.einsum("pck,k->pc", basis[:, 1:], middle)
-        return Parts(
-            reason=reason,
-            lines=(1.0 - kept.sum(axis=1) / len(band.basis)).astype(np.float32),
-            values=values,
-            before=np.where(present, before, np.nan).T,
-            n_averaged=n_averaged,
-            gain=centre,
-            gain_slope=components[..., None] / centre[:, None],
-            bend=_over(further[:, session.AUTOS].T, _noise(values, n_averaged)),
-            scatter=np.empty(0),
-            line_scatter=np.array([flags.robust_scale(z[:, 0], kept)]),
-        )
+        return {
+            "reason": reason,
+            "lines": (1.0 - kept.sum(axis=1) / len(band.basis)).astype(np.float32),
+            "values": values,
+            "before": np.where(present, before, np.nan).T,
+            "n_averaged": n_averaged,
+            "gain": centre,
+            "gain_slope": components[..., None] / centre[:, None],
+            "bend": _over(further[:, session.AUTOS].T, _noise(values, n_averaged)),
+            "line_scatter": np.array([flags.robust_scale(z[:, 0], kept)]),
+        }
 
     return calibrate
 
@@ -294,9 +277,10 @@ def _finish(
     seconds: Rows, live: Rows, bin_of: session.RowCounts, false_alarm: float, spectra: Parts
 ) -> Parts:
     """Flag bursts, spectra that do not fit those before and after; average the others in bins."""
-    noise, reason = _noise(spectra.values, spectra.n_averaged), spectra.reason
+    all_values, reason = spectra["values"], spectra["reason"]
+    noise = _noise(all_values, spectra["n_averaged"])
     # absent autos neither stand out nor constrain the curve
-    autos = spectra.values[session.AUTOS].T
+    autos = all_values[session.AUTOS].T
     finite = np.isfinite(autos)
     shown, sigma = np.where(finite, autos, 0.0), np.where(finite & (noise.T > 0.0), noise.T, np.inf)
     burst, scatter = flags.burst_flags(seconds, shown, sigma, reason == reduced.USED, false_alarm)
@@ -304,25 +288,24 @@ def _finish(
     good = reason == reduced.USED
     bin_of = bin_of - bin_of[0]
     n = int(bin_of[-1]) + 1
-    kept, used = by_the_rule(np.isfinite(spectra.values) & good, bin_of, live)
+    kept, used = by_the_rule(np.isfinite(all_values) & good, bin_of, live)
     # weights are live times, both for the unflagged spectra and for all
     weights = np.where(used, live, 0.0)
     some = np.bincount(bin_of, weights, n) > 0.0
     with np.errstate(invalid="ignore", divide="ignore"):
-        squares = np.where(used, weights**2 / spectra.n_averaged, 0.0)
+        squares = np.where(used, weights**2 / spectra["n_averaged"], 0.0)
         n_averaged = np.bincount(bin_of, weights, n) ** 2 / np.bincount(bin_of, squares, n)
     n_averaged = np.where(some, n_averaged, 0.0)
     averaged = partial(_means, first=np.searchsorted(bin_of, np.arange(n)))
-    values = np.where(kept & some, averaged(spectra.values, weights), np.nan)
-    return replace(
-        spectra,
-        reason=np.where(good & ~used, np.uint8(reduced.PRODUCT), reason),
-        values=values,
-        n_averaged=n_averaged,
-        bend=_over(averaged(spectra.bend * noise, weights), _noise(values, n_averaged)),
-        scatter=scatter,
-        **{n: averaged(getattr(spectra, n), live) for n in ("before", "gain", "gain_slope")},
-    )
+    values = np.where(kept & some, averaged(all_values, weights), np.nan)
+    return spectra | {
+        "reason": np.where(good & ~used, np.uint8(reduced.PRODUCT), reason),
+        "values": values,
+        "n_averaged": n_averaged,
+        "bend": _over(averaged(spectra["bend"] * noise, weights), _noise(values, n_averaged)),
+        "scatter": scatter,
+        **{name: averaged(spectra[name], live) for name in ("before", "gain", "gain_slope")},
+    }
 
 
 def _means(

@@ -39,6 +39,7 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.constants import Boltzmann, physical_constants, speed_of_light
+from scipy.fft import dct, dst
 from scipy.special import roots_legendre
 
 from lusee_bayes.core.arrays import Array
@@ -165,16 +166,14 @@ def cardinal_functions(theta: Angles, intervals: int, parity: int) -> np.ndarray
     -------
     (theta, samples) array
     """
-    samples = np.pi * np.arange(2 * intervals) / intervals
-    difference = theta[:, None] - samples[None]
-    orders = np.arange(1, intervals)
-    kernel = 1.0 + np.cos(intervals * difference)
-    kernel = (kernel + 2.0 * np.cos(orders[:, None, None] * difference).sum(0)) / (2 * intervals)
-    cardinal, mirrored = kernel[:, : intervals + 1].copy(), kernel[:, :intervals:-1]
-    cardinal[:, 1:-1] += mirrored if parity == 0 else -mirrored
-    if parity:
-        cardinal[:, [0, -1]] = 0.0
-    return cardinal
+    waves = theta[:, None] * np.arange(intervals + 1)
+    if parity == 0:
+        of_wave = dct(np.eye(intervals + 1), type=1, axis=0) / intervals
+        of_wave[[0, -1]] /= 2.0
+        return np.cos(waves) @ of_wave
+    # odd functions are zero at the poles
+    of_wave = np.pad(dst(np.eye(intervals - 1), type=1, axis=0) / intervals, 1)
+    return np.sin(waves) @ of_wave
 
 
 VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]
