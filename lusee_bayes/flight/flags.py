@@ -389,8 +389,8 @@ def _about_stretches(z: Distances, kept: Span, limit: float) -> Span:
     beyond = np.zeros(len(kept), dtype=bool)
     for length in LENGTHS[1:]:
         if length <= len(kept) // 2:
-            for start in np.flatnonzero((_sizes_of(sums, counts, length) > limit).any(axis=0)):
-                beyond[start : start + length] = True
+            starts = (_sizes_of(sums, counts, length) > limit).any(axis=0)
+            beyond |= np.convolve(starts, np.ones(length)) > 0.0
     return beyond & kept
 
 

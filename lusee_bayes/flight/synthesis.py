@@ -338,9 +338,7 @@ def _tone_channels(
 
 def _drawn_stretches(generator: np.random.Generator, n: int, share: float, length: int) -> RowFlags:
     """Stretches of spectra, about this share of all."""
-    chosen = np.zeros(n, dtype=bool)
     if share == 0.0:
-        return chosen
-    for start in np.flatnonzero(generator.uniform(size=n) < share / length):
-        chosen[start : start + length] = True
-    return chosen
+        return np.zeros(n, dtype=bool)
+    starts = generator.uniform(size=n) < share / length
+    return np.convolve(starts, np.ones(length))[:n] > 0.0

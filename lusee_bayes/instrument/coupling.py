@@ -684,24 +684,4 @@ class Instrument(eqx.Module):
         InputError
             If there is no parameter of that name.
         """
-        return self.coupling_of(self.beams(values))
-
-    def coupling_of(self, beams: ProductBeams) -> CouplingMatrix:
-        """Compute A for given beams, or dA for a difference of beams.
-
-        Parameters
-        ----------
-        beams : ProductBeams
-            Up to the instrument's lmax.
-
-        Returns
-        -------
-        CouplingMatrix
-            For the instrument's orientations and layout.
-
-        Raises
-        ------
-        InputError
-            If the beams have another lmax or other products.
-        """
-        return CouplingMatrix.build(beams, self.pointing, self.layout)
+        return CouplingMatrix.build(self.beams(values), self.pointing, self.layout)

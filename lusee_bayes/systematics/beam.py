@@ -120,7 +120,7 @@ class BeamErrors(Systematic):
             setup,
             beam_source=source,
             beams=beams,
-            coupling=setup.instrument.coupling_of(beams),
+            coupling=CouplingMatrix.build(beams, setup.pointing, setup.layout),
             background=setup.background + (emitted - nominal)[:, None],
             responses=source_responses(setup.scenario, setup.observation, source, frequency_mhz),
         )

@@ -183,7 +183,7 @@ def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing,
 
 @pytest.fixture(scope="module")
 def base(instrument):
-    coupling = instrument.coupling_of(instrument.beams())
+    coupling = instrument.coupling()
     prior = lb.HarmonicPrior(1e6 / (1.0 + jnp.arange(LOW + 1.0)) ** 2)
     noise = lb.DiagonalCovariance(jnp.full(coupling.shape[0], 4.0))
     return lb.LinearGaussian(coupling, prior, noise)
@@ -214,17 +214,17 @@ def test_sites_of_the_antennas_parameters(instrument, base):
     assert got == pytest.approx(expected, rel=1e-10)
 
 
-def test_the_amplitude_of_a_beam_error(instrument, base):
+def test_the_amplitude_of_a_beam_error(instrument, base, pointing, layout):
     other = lb.monopole_beams(29.0, LOW)
     own = instrument.beams()
-    error = BeamError(instrument.coupling_of(ProductBeams(other.modes - own.modes, FREQUENCY)))
+    error = BeamError(CouplingMatrix.of_modes(other.modes - own.modes, pointing, layout))
     sky = base.prior.sample(jax.random.key(3))
     for amplitude in (0.0, 0.7, 1.0):
         value = {"beam_amplitude": jnp.asarray(amplitude)}
         with handlers.trace() as trace, handlers.seed(rng_seed=0), handlers.substitute(data=value):
             model = error.sampled(base)
         mixed = ProductBeams((1 - amplitude) * own.modes + amplitude * other.modes, FREQUENCY)
-        expected = instrument.coupling_of(mixed)
+        expected = CouplingMatrix.build(mixed, pointing, layout)
         # linear in the beams, as a product and as a matrix
         close(model.coupling @ sky, expected @ sky, 1e-12)
         close(model.coupling.dense(), expected.dense(), 1e-13)
@@ -246,7 +246,7 @@ def test_what_cannot_be_is_refused(coupling, instrument, base, pointing):
     refuse(words, instrument.source.with_values, {"lenght_m": 0.1})
     # a direction has no gains, and the same samples
     one, plus = jnp.ones(()), base.coupling.plus
-    error = instrument.coupling_of(instrument.beams())
+    error = instrument.coupling()
     refuse("without a separate response", plus, one, error.with_response(jnp.ones(error.shape[0])))
     complete = lb.CouplingMatrix.build(instrument.beams(), pointing)
     refuse("contain different samples", plus, one, complete)

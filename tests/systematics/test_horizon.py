@@ -90,7 +90,7 @@ def test_terrain_of_the_skys_temperature_cannot_be_seen(values):
     section = "altitude_deg: 4, std_deg: 2, harmonics: 2, moon_temperature_k: "
     warm, cold = (models.moved(setup_of(section + k), values) for k in ("300", "0"))
     uniform = np.eye(1, (LMAX + 1) ** 2)[0] * 300.0 * np.sqrt(4.0 * np.pi)
-    expected = np.asarray(cold.instrument.coupling_of(cold.beams) @ uniform)
+    expected = np.asarray(cold.instrument.coupling() @ uniform)
     close(warm.coupling @ uniform + warm.offset, expected, 1e-13)
     assert off(cold.coupling @ uniform, expected) > 1e-4
     # the signal, which sets the noise, follows

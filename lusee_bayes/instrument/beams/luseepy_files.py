@@ -409,14 +409,13 @@ def read_response(path: str | Path) -> PortResponse:
 
 
 FIELD_NAMES = ("Etheta", "EPhi")
-FIELDS = parts_of(*FIELD_NAMES)
 IMPEDANCE = ("Z_real", "Z_imag")
 FIELD, OHM = Variable(("freq", "theta", "phi")), Variable(("freq",), optional=True, unit="Ohm")
 ENDS = {"THETA_MIN": 0.0, "THETA_MAX": 90.0, "PHI_MIN": 0.0, "PHI_MAX": 360.0}
 SCALAR_LAYOUT = Layout(
     "a scalar beam file of luseepy, FITS version 2",
     {
-        **dict.fromkeys(FIELDS, FIELD),
+        **dict.fromkeys(parts_of(*FIELD_NAMES), FIELD),
         "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
         "gain_conv": Variable(("freq",)),
         **dict.fromkeys(IMPEDANCE, OHM),
