@@ -29,7 +29,7 @@ from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import naming, read_model
 from lusee_bayes.core.section import Section
-from lusee_bayes.instrument.times import scale_of, time_of_text, unannounced_leap_seconds, utc_of
+from lusee_bayes.instrument import times
 
 DAY_S, MJD_ZERO = 86400.0, 2400000.5
 # clocks that differ by less are equal
@@ -108,19 +108,18 @@ class Clock:
         """
         days = self.rate * (raw_s - self.raw_s) / DAY_S
         whole = np.floor(days)
-        return utc_of(self.jd1 + whole, self.jd2 + (days - whole), self.scale)
+        return times.utc_of(self.jd1 + whole, self.jd2 + (days - whole), self.scale)
 
     @property
     def isot(self) -> str:
         """The reference time as text, in its own scale."""
-        with unannounced_leap_seconds():
+        with times.unannounced_leap_seconds():
             return str(Time(self.jd1, self.jd2, format="jd", scale=self.scale, precision=9).isot)
 
     def differs_s(self, other: Clock, raw_s: Times) -> float:
         """Return the largest difference between two clocks over these readings, in seconds."""
         ends = np.array([raw_s.min(), raw_s.max()])
-        with unannounced_leap_seconds():
-            return float(np.abs((self.utc(ends) - other.utc(ends)).sec).max())
+        return float(np.abs(times.seconds_from(other.utc(ends), self.utc(ends))).max())
 
 
 def read_clock(path: str | Path) -> Clock:
@@ -143,11 +142,12 @@ def read_clock(path: str | Path) -> Clock:
             "to correct the UTC stated in sessions; see docs/howto/first_light.md"
         )
     with naming(path):
-        scale = scale_of("time_scale", file.time_scale)
-        time = time_of_text("clock_reference_isot", file.clock_reference_isot, scale)
+        scale = times.scale_of("time_scale", file.time_scale)
+        time = times.time_of_text("clock_reference_isot", file.clock_reference_isot, scale)
         clock = Clock(str(path), float(time.jd1), float(time.jd2), scale, 0.0, file.rate)
         if file.clocks is None:
-            return replace(clock, stated=time_of_text("stated_utc_isot", file.stated_utc_isot))
+            stated = times.time_of_text("stated_utc_isot", file.stated_utc_isot)
+            return replace(clock, stated=stated)
         return replace(clock, raw_s=file.clocks.spectrometer.clock_reference_raw_seconds)
 
 
@@ -182,8 +182,7 @@ def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: T
                 f"{path} contains no UTC for {given.source} to correct; give a clock file with "
                 "clocks in place of stated_utc_isot"
             )
-        with unannounced_leap_seconds():
-            since_s = float((given.stated - said.utc(np.array([said.raw_s]))[0]).sec)
+        since_s = float(times.seconds_from(said.utc(np.array([said.raw_s]))[0], given.stated))
         raw_s = said.raw_s + since_s / said.rate
         return replace(given, raw_s=raw_s, rate=given.rate * said.rate, stated=None)
     if given is None or said is None:

@@ -18,7 +18,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import moved, set_up, true_signal, true_values
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, product_beams
-from lusee_bayes.instrument.beams.luseepy_files import FIELDS
+from lusee_bayes.instrument.beams.luseepy_files import FIELD_NAMES, parts_of
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.pointing import Pointing
@@ -224,7 +224,7 @@ def test_a_scenario_with_a_file(tmp_path):
 
 def test_a_second_file_as_the_true_beams(tmp_path):
     def brighter(images):
-        for name in FIELDS:
+        for name in parts_of(*FIELD_NAMES):
             images[name] = 1.01 * images[name]
 
     path, other = write(tmp_path / "a.fits"), write(tmp_path / "b.fits", change=brighter)

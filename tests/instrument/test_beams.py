@@ -130,7 +130,7 @@ def test_the_rectangle_rule():
     n = 91
     fields = np.ones((1, n, 180), dtype=complex)
     beam = ScalarBeam("", np.ones(1), np.linspace(0.0, np.pi / 2, n), fields, fields, np.ones(1))
-    grid = beam.luseepy_grid
+    grid = beam.luseepy_grid()
     step = np.pi / 180
     found, expected = grid.integrate(np.ones((1, n, 180))), 1.0 + step / 2 - step**2 / 12
     assert float(found[0]) == pytest.approx(2 * np.pi * expected, rel=1e-9)

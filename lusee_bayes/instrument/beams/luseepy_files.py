@@ -251,10 +251,9 @@ class LuseepyBeam(Described, BeamSource):
         """Number of azimuths."""
         return self.e_theta.shape[-1]
 
-    @property
     @abstractmethod
     def luseepy_grid(self) -> HemisphereGrid:
-        """The directions of the file with luseepy's rule."""
+        """Return the directions of the file with luseepy's rule."""
 
     @abstractmethod
     def _received(
@@ -274,7 +273,7 @@ class LuseepyBeam(Described, BeamSource):
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         # these nodes treat the cut at the horizon exactly
         exact = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
-        grid = self.luseepy_grid if self.luseepy_quadrature else exact
+        grid = self.luseepy_grid() if self.luseepy_quadrature else exact
         if self.interpolation == "spline":
             weighted = [(1.0, self.fields(frequency_mhz, grid))]
         else:
@@ -326,9 +325,8 @@ class PortResponse(LuseepyBeam):
     receiver_said: bool = True
     antenna_k: float = 0.0
 
-    @property
     def luseepy_grid(self) -> BandLimitedGrid:
-        """The directions of the file with the rule of luseepy's four-port engine."""
+        """Return the directions of the file with the rule of luseepy's four-port engine."""
         return BandLimitedGrid.of(self.theta, self.n_phi)
 
     def behind(self, receiver: Receiver | None) -> PortResponse:
@@ -460,9 +458,8 @@ class ScalarBeam(LuseepyBeam):
     def n_ports(self) -> int:
         return len(self.rotations_deg)
 
-    @property
     def luseepy_grid(self) -> HemisphereGrid:
-        """The directions of the file with sin(theta) dtheta dphi, in equal steps up to pi / 2."""
+        """Return the directions of the file with sin(theta) dtheta dphi, in steps up to pi / 2."""
         return HemisphereGrid(self.theta, np.sin(self.theta) * self.theta[1], self.n_phi)
 
     def _received(self, parts, file_mhz, mhz, grid):

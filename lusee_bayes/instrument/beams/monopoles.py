@@ -382,9 +382,7 @@ def beams_towards(
             )
     monopoles = Monopoles() if monopoles is None else monopoles
     # an array: one compilation for all frequencies
-    frequency = _array(frequency_mhz)
-    patterns = _patterns(frequency, directions, monopoles, stokes)
-    return patterns / _normalisation(frequency, monopoles)
+    return _patterns(_array(frequency_mhz), directions, monopoles, stokes)
 
 
 @compiled
@@ -398,13 +396,9 @@ def _patterns(
     east, north, up = xp.where(visible[:, None], directions, stand_in).T
     theta, phi = xp.arctan2(xp.hypot(east, north), up), xp.arctan2(north, east)
     patterns = to_real(stokes_pairs(*monopoles.towards(frequency_mhz, theta, phi), stokes))
-    return xp.where(visible[None], patterns, 0.0)
-
-
-@compiled
-def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Float[Array, ""]:
     grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
-    return mean_auto_integral(monopoles.fields(frequency_mhz, grid))
+    scale = mean_auto_integral(monopoles.fields(frequency_mhz, grid))
+    return xp.where(visible[None], patterns / scale, 0.0)
 
 
 def source_response(
