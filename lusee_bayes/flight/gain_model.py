@@ -298,17 +298,17 @@ ARRAYS = {"freqs": ("anchor",), "mean": ("anchor",), "eigvecs": ("anchor", N_COM
 
 
 def _read_folder(folder: Path, model: str) -> GainModel:
-    names = {name: [f"{place}_{name}" for place in PLACES] for name in ARRAYS}
-    files, layout = {}, {}
-    for name, of_places in names.items():
-        for one in of_places:
-            path = require_file(folder / f"{one}.npy", "a gain table", HINT)
-            with reading(path, "an array of luseepy's gain model"), path.open("rb") as file:
-                values = np.load(file, allow_pickle=False)
-            files[one] = values[:, :N_COMPONENTS] if values.ndim == 2 else values
-            layout[one] = Variable(ARRAYS[name])
+    layout = {
+        f"{place}_{name}": Variable(dims) for name, dims in ARRAYS.items() for place in PLACES
+    }
+    files = {}
+    for name in layout:
+        path = require_file(folder / f"{name}.npy", "a gain table", HINT)
+        with reading(path, "an array of luseepy's gain model"), path.open("rb") as file:
+            values = np.load(file, allow_pickle=False)
+        files[name] = values[:, :N_COMPONENTS] if values.ndim == 2 else values
     arrays = Layout("luseepy's gain model", layout).checked(folder, files, {}).arrays
-    stacks = (np.stack([arrays[one] for one in of_places]) for of_places in names.values())
+    stacks = (np.stack([arrays[f"{place}_{name}"] for place in PLACES]) for name in ARRAYS)
     mhz, mean, vectors = (stack.reshape(*LEAD, *stack.shape[1:]) for stack in stacks)
     coefficients = _coefficients(folder / "alpha_refit.csv", model)
     kind = f"luseepy's gain model, {model} coefficients"

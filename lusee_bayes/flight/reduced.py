@@ -309,11 +309,9 @@ class Reduced(Described):
         if self.gain_std is not None:
             yield place, np.where(at_level, self.gain_std, 0.0)
         if self.component_std is not None:
-            slopes = (
-                self.component_std[PLACES[place]][:, None] * self.gain_slope[band, port][:, bins]
-            )
-            for number, slope in enumerate(slopes, start=1):
-                yield f"{place} PC{number}", np.where(at_level, slope, 0.0)
+            for r, std in enumerate(self.component_std[PLACES[place]]):
+                slope = std * self.gain_slope[band, port, r, bins]
+                yield f"{place} PC{r + 1}", np.where(at_level, slope, 0.0)
 
     def without(self, band: int, gone: Bool[np.ndarray, "products bins"]) -> Reduced:
         """Return the reduction without some values of a band, which do not fit the map."""

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import lru_cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -71,13 +72,12 @@ def reduce_sessions(
         ThreadPoolExecutor(1) as ahead,
     ):
         pieces = _pieces(line)
-        counts = _read_ahead(ahead, files, line, pieces)
-        for piece in pieces:
-            slabs = [
-                in_threads(_slab(line, recipe, start, next(counts)), numbers)
-                for start in range(piece.start, piece.stop, SLAB)
-            ]
-            spectra = [_joined(band) for band in zip(*slabs, strict=True)]
+        counts = _read_ahead(ahead, files, line, [rows for slabs in pieces for rows in slabs])
+        for slabs in pieces:
+            piece = slice(slabs[0].start, slabs[-1].stop)
+            calibrators = (_slab(line, recipe, rows.start, next(counts)) for rows in slabs)
+            parts = [in_threads(calibrate, numbers) for calibrate in calibrators]
+            spectra = [_joined(band) for band in zip(*parts, strict=True)]
             seconds = seconds_from(times[piece.start], times[piece])
             of_piece = seconds, live_s[piece], line.bin_of[piece], recipe.section.false_alarm
             averages.append(in_threads(partial(_finish, *of_piece), spectra))
@@ -123,22 +123,23 @@ def _joined(parts: Sequence[Parts]) -> Parts:
     return {name: np.concatenate([x[name] for x in parts], axis=-1) for name in parts[0]}
 
 
-def _pieces(line: Timeline) -> list[slice]:
-    """Rows of whole bins of one state, as few as ``PIECE`` allows, for each piece."""
+def _pieces(line: Timeline) -> list[list[slice]]:
+    """Rows of whole bins of one state, as few as ``PIECE`` allows, in slabs, for each piece."""
     run, bin_of = line.observation.run, line.bin_of
-    ends = np.flatnonzero(np.append(np.diff(bin_of) != 0, True)) + 1
+    ends = (np.flatnonzero(np.append(np.diff(bin_of) != 0, True)) + 1).tolist()
     pieces, start = [], 0
     for k, end in enumerate(ends):
         if k + 1 == len(ends) or end - start >= PIECE or run[ends[k + 1] - 1] != run[start]:
-            pieces.append(slice(start, int(end)))
-            start = int(end)
+            edges = [*range(start, end, SLAB), end]
+            pieces.append([slice(first, last) for first, last in pairwise(edges)])
+            start = end
     return pieces
 
 
 def _read_ahead(
-    ahead: ThreadPoolExecutor, files: ExitStack, line: Timeline, pieces: list[slice]
+    ahead: ThreadPoolExecutor, files: ExitStack, line: Timeline, slabs: list[slice]
 ) -> Iterator[np.ndarray]:
-    """Yield the counts of every slab of every piece; the next slab is read meanwhile."""
+    """Yield the counts of every slab; the next slab is read meanwhile."""
     reads: dict[int, session.Read] = {}
 
     def counts(rows: slice) -> np.ndarray:
@@ -148,11 +149,6 @@ def _read_ahead(
         first = int(line.row[rows.start])
         return reads[number](first, first + rows.stop - rows.start)
 
-    slabs = [
-        slice(start, min(start + SLAB, piece.stop))
-        for piece in pieces
-        for start in range(piece.start, piece.stop, SLAB)
-    ]
     following: Future[np.ndarray] = ahead.submit(counts, slabs[0])
     for rows in slabs[1:]:
         read, following = following.result(), ahead.submit(counts, rows)

@@ -285,12 +285,10 @@ class Visibilities(checks.Described):
         return cls(layout.gather(values), layout, observation, float(frequency_mhz))
 
     def description(self) -> tuple[str, ...]:
-        missing = f", {self.n_missing} absent" if self.n_missing else ""
         truth = "" if self.truth is None else f"; simulated, lmax = {lmax_of(len(self.truth))}"
         unsaid = "meaning of the times unknown: --set observation.timestamp=..."
         return (
-            f"{self.layout.n_products} products x {self.layout.n_times} times at "
-            f"{self.frequency_mhz:g} MHz, {self.layout.size} data{missing}",
+            f"{self.layout.description()[0]} at {self.frequency_mhz:g} MHz",
             f"{checks.extent(self.data, 'K')}{truth}; products {checks.listed(self.labels)}",
             *self.observation.description(),
             *([] if self.says_window else [unsaid]),
