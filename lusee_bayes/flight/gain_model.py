@@ -351,11 +351,9 @@ def _terms(port: int) -> tuple[str, ...]:
 MEAN = {"L": 7e-4, "M": 3e-2, "H": 1.5}
 ANCHORS_MHZ = np.array([0.1, 0.7, 1.1, 3.1, *np.linspace(7.1, 70.1, 12)])
 # coefficients of q_1 and q_2 for the telemetry: 1, F, A, V, D, I, F^2, A^2, F A
-TERMS = np.array(
-    [
-        [0.0, 2e-4, 1e-4, 1e-2, 1e-2, 5e-2, 1e-6, 1e-6, 0.0],
-        [1e-3, 1e-4, -1e-4, 0.0, 0.0, 0.0, 0.0, 1e-6, -1e-6],
-    ]
+TERMS = (
+    (0.0, 2e-4, 1e-4, 1e-2, 1e-2, 5e-2, 1e-6, 1e-6, 0.0),
+    (1e-3, 1e-4, -1e-4, 0.0, 0.0, 0.0, 0.0, 1e-6, -1e-6),
 )
 # the gain falls towards the ends of the band
 LOW_MHZ, HIGH_MHZ = 0.2, 80.0

@@ -340,9 +340,8 @@ class Observation(checks.Described):
 
         The lander leans first towards North, about East, then towards East, about North.
         """
-        east, north = np.radians(self.tilt_deg)
-        turned = SpatialRotation.from_rotvec([0.0, east, 0.0])
-        turned *= SpatialRotation.from_rotvec([-north, 0.0, 0.0])
+        east, north = self.tilt_deg
+        turned = SpatialRotation.from_euler("YX", [east, -north], degrees=True)
         return turned.inv().as_matrix() @ self.topocentric_from_mcmf()
 
     def zenith_galactic(self) -> Vectors:

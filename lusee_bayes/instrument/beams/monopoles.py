@@ -332,9 +332,6 @@ PARAMETERS: Mapping[str, tuple[Callable[[Monopoles], Float[Array, ""]], float, f
 # rotations keep |n| = 1 to rounding; a larger deviation is a mistake
 UNIT_TOLERANCE = 1e-9
 
-# the autos' integral is converged on this grid, which serves every lmax up to 63
-NORMALISATION_LMAX = 63
-
 
 def beams_towards(
     frequency_mhz: Scalar,
@@ -396,7 +393,8 @@ def _patterns(
     east, north, up = xp.where(visible[:, None], directions, stand_in).T
     theta, phi = xp.arctan2(xp.hypot(east, north), up), xp.arctan2(north, east)
     patterns = to_real(stokes_pairs(*monopoles.towards(frequency_mhz, theta, phi), stokes))
-    grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
+    # the autos' integral is converged on the coarsest grid
+    grid = HemisphereGrid.for_lmax(0)
     scale = mean_auto_integral(monopoles.fields(frequency_mhz, grid))
     return xp.where(visible[None], patterns / scale, 0.0)
 
