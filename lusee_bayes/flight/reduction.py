@@ -33,8 +33,6 @@ from lusee_bayes.instrument.times import seconds_from
 
 # spectra in a slab, and fewest spectra of a piece that ends between two bins
 SLAB, PIECE = 128, 1024
-# gains of the ports, each with two components, in the bins of one state
-Curve = Float[np.ndarray, "ports 3 bins"]
 # numbers of a band by their names in Reduced, without the axis of bands: of some spectra, each of
 # which is a bin, or of the bins of a piece. Also "bend", the change of the autos by two further
 # powers of the frequency in standard deviations (ports, bins). "scatter" has a value for every span
@@ -159,7 +157,7 @@ def _read_ahead(
 @lru_cache(maxsize=16)
 def _prepared(
     recipe: Recipe, navgf: int, levels: tuple[str, ...]
-) -> tuple[tuple[ChannelBand, ...], Curve, flags.BinFlags]:
+) -> tuple[tuple[ChannelBand, ...], Float[np.ndarray, "ports 3 bins"], flags.BinFlags]:
     """Return what many spectra share: the bands, the gains, and the bins with known lines.
 
     The gains are mean and components, averaged over the channels of every bin; NaN where there are
