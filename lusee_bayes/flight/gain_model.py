@@ -317,28 +317,27 @@ def _read_folder(folder: Path, model: str) -> GainModel:
 
 def _coefficients(path: Path, model: str) -> np.ndarray:
     columns = read_table(path, CSV, HINT)
-    places = {
-        f"{name} PC{r + 1} {term}": (*place, r, k)
-        for name, place in PLACES.items()
+    names = [
+        f"{place} PC{r + 1} {term}"
+        for place, (_, port) in PLACES.items()
         for r in range(N_COMPONENTS)
-        for k, term in enumerate(_terms(place[1]))
-    }
-    coefficients, seen = np.zeros((*LEAD, N_COMPONENTS, N_TERMS)), set()
+        for term in _terms(port)
+    ]
+    found: dict[str, float] = {}
     rows = zip(*(columns[name] for name in CSV.variables), strict=True)
     for number, (setting, component, family, term, value) in enumerate(rows, start=2):
         if str(family).strip().lower() != model:
             continue
         name = f"{setting.strip().upper()} {component.strip().upper()} {term.strip()}"
-        require_known(f"{path}: line {number}: unknown coefficient", name, places)
-        if name in seen:
+        require_known(f"{path}: line {number}: unknown coefficient", name, names)
+        if name in found:
             raise InputError(f"{path}: line {number} repeats {name}")
-        seen.add(name)
-        coefficients[places[name]] = value
-    given = {name.rpartition(" ")[0] for name in seen}
-    lacking = dict.fromkeys(one for name in places if (one := name.rpartition(" ")[0]) not in given)
+        found[name] = value
+    given = {name.rpartition(" ")[0] for name in found}
+    lacking = dict.fromkeys(one for name in names if (one := name.rpartition(" ")[0]) not in given)
     if lacking:
         raise InputError(f"{path} has no coefficients of model {model} for {', '.join(lacking)}")
-    return coefficients
+    return np.array([found.get(name, 0.0) for name in names]).reshape(*LEAD, N_COMPONENTS, N_TERMS)
 
 
 def _terms(port: int) -> tuple[str, ...]:
