@@ -19,7 +19,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
-from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, Instrument
+from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -89,11 +89,8 @@ def set_up(
         )
     with stages("coupling"):
         coupling = CouplingMatrix.build(beams, pointing, None if data is None else data.layout)
-        instrument = Instrument(
-            source, pointing, coupling.layout, scenario.frequency_mhz, scenario.lmax
-        )
         background = np.repeat(background[:, None], observation.n_times, axis=1)
-        pieces = observation, sky, source, instrument, beams, coupling, prior, responses, background
+        pieces = observation, sky, source, source, beams, coupling, prior, responses, background
         calibration = None if data is None else data.calibration
         of_data = {"receiver": receiver, "calibration": calibration, "measured": data is not None}
         setup = Setup(scenario, *pieces, **of_data, family=family).with_signal()
@@ -151,20 +148,11 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
 
 
 def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
-    """Radiometer term of N in K^2, from the visibilities of :func:`.radiometer_about`.
-
-    Averages of spectra contain the number of samples averaged; for other data, it follows from the
-    scenario's bandwidth and duty cycle.
-    """
+    """Radiometer term of N in K^2, from the visibilities of :func:`.radiometer_about`."""
     section = setup.scenario.noise.radiometer
     around = around or Around()
     visibilities = noise_visibilities(setup, around, radiometer_about(setup))
-    if setup.calibration is not None:
-        given = {"bandwidth_hz": 1.0, "step_s": setup.calibration.n_averaged}
-    else:
-        given = section.model_dump(include={"bandwidth_hz", "duty_cycle"})
-        given["step_s"] = setup.observation.live_s
-    given["factor"] = section.factor
+    given = {"bandwidth_hz": 1.0, "step_s": setup.n_averaged, "factor": section.factor}
     if around.tempered == 1.0:
         return radiometer_noise(visibilities, setup.layout, **given, form=section.form)
     # far from the mode, without the directions in which correlated noise is smallest

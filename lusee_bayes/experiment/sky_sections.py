@@ -28,7 +28,7 @@ from lusee_bayes.sampling.log_normal_prior import LogNormalPrior
 from lusee_bayes.sky import sky_source
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, diffuse_brightness, galactic_share
 from lusee_bayes.sky.positive_skies import LogNormalSky, PositiveSkies, deviation_spectrum
-from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
+from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_spectrum
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
@@ -258,7 +258,8 @@ class IsotropicPriorSection(SpectrumSection):
             spectrum = read_spectrum(self.spectrum_file, sky.lmax) * steepening**2
         mean = None
         if self.mean_file is not None:
-            mean = read_mean(self.mean_file, read_at, sky.lmax) * steepening
+            path = require_file(self.mean_file, "mean map of the prior", "check prior.mean_file")
+            mean = sky_source.read_sky_file(path).modes_at(read_at, sky.lmax) * steepening
         return HarmonicPrior(spectrum * self.scale, mean=mean)
 
     @property

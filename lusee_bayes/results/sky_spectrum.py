@@ -27,7 +27,6 @@ from functools import lru_cache
 import numpy as np
 from astropy.table import Table
 from jaxtyping import Bool, Float
-from scipy.constants import Boltzmann, speed_of_light
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
 from lusee_bayes.core.errors import InputError, nearest
@@ -38,6 +37,7 @@ from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.sky.galaxy import kelvin_steradian
 
 Frequencies = Float[np.ndarray, " frequency"]
 Rows = Float[np.ndarray, "area mode"]
@@ -377,33 +377,26 @@ class IndexMaps:
         return cls(reference, maps)
 
 
-def brightness_temperature(
-    intensity: Float[np.ndarray, " n"], frequencies_mhz: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
-    """T = I c^2 / (2 k f^2), in K, for I in W m^-2 Hz^-1 sr^-1."""
-    return intensity * (speed_of_light / (1e6 * frequencies_mhz)) ** 2 / (2.0 * Boltzmann)
-
-
 def cane_1979(frequencies_mhz: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Temperature of the Galactic poles, in K (Cane 1979, MNRAS 189, 465).
 
     I_g f^-0.52 (1 - exp(-tau)) / tau + I_eg f^-0.80 exp(-tau) with tau = 5.0 f^-2.1, f in MHz,
-    I_g = 2.48e-20 and I_eg = 1.06e-20 W m^-2 Hz^-1 sr^-1.
+    I_g = 2.48 MJy/sr and I_eg = 1.06 MJy/sr.
     """
     f = np.asarray(frequencies_mhz)
     tau = 5.0 * f**-2.1
-    galactic = 2.48e-20 * f**-0.52 * -np.expm1(-tau) / tau
-    return brightness_temperature(galactic + 1.06e-20 * f**-0.80 * np.exp(-tau), f)
+    galactic = 2.48e6 * f**-0.52 * -np.expm1(-tau) / tau
+    return kelvin_steradian(galactic + 1.06e6 * f**-0.80 * np.exp(-tau), f)
 
 
 def novaco_brown_1978(frequencies_mhz: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Mean temperature of the sky from RAE 2, in K (Novaco and Brown 1978, ApJ 221, 114).
 
-    I = 1.38e-19 f^-0.76 exp(-3.28 f^-0.64) W m^-2 Hz^-1 sr^-1, f in MHz, as written by Zaslavsky et
-    al. 2011 (Radio Science 46, RS2008); measured up to 9 MHz.
+    I = 13.8 f^-0.76 exp(-3.28 f^-0.64) MJy/sr, f in MHz, as written by Zaslavsky et al. 2011 (Radio
+    Science 46, RS2008); measured up to 9 MHz.
     """
     f = np.asarray(frequencies_mhz)
-    return brightness_temperature(1.38e-19 * f**-0.76 * np.exp(-3.28 * f**-0.64), f)
+    return kelvin_steradian(13.8e6 * f**-0.76 * np.exp(-3.28 * f**-0.64), f)
 
 
 # published spectra by name, each with the frequencies of its measurements in MHz

@@ -546,13 +546,16 @@ def brightness(synchrotron: np.ndarray, depth: np.ndarray, frequency_mhz: float)
     return synchrotron + thermal + behind
 
 
-def _towards(theta: Vector, phi: Vector) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
-    """Lines of sight, the same at all frequencies, and the side and line of each direction."""
-    return _slabs(np.stack([theta, phi]).astype(np.float64).tobytes())
+def _synchrotron(frequency_mhz: float, theta: Vector, phi: Vector) -> tuple[Vector, Vector]:
+    """Synchrotron emission in K and total optical depth in Galactic directions, in radians."""
+    slabs, places = _slabs(np.stack([theta, phi]).astype(np.float64).tobytes())
+    synchrotron, depth = slabs.synchrotron(frequency_mhz)
+    return synchrotron[places], depth[places]
 
 
 @lru_cache(maxsize=2)
 def _slabs(points: bytes) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
+    """Lines of sight, the same at all frequencies, and the side and line of each direction."""
     theta, phi = np.frombuffer(points).reshape(2, -1)
     # lines of sight above and below the plane share their symmetric parts, computed once
     key = np.abs(0.5 * np.pi - theta).round(12) + 1j * phi.round(12)
@@ -680,8 +683,8 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> n
     if seed is not None and seed < 0:
         raise InputError(f"seed is {seed}, expected an integer >= 0; use 1, for example")
 
-    slabs, places = _towards(*healpy.pix2ang(nside, np.arange(12 * nside**2)))
-    synchrotron, depth = (values[places] for values in slabs.synchrotron(frequency_mhz))
+    pixels = healpy.pix2ang(nside, np.arange(12 * nside**2))
+    synchrotron, depth = _synchrotron(frequency_mhz, *pixels)
     if seed is None:
         return brightness(synchrotron, depth, frequency_mhz)
     drawn = Structures.of(nside, seed)
@@ -705,10 +708,9 @@ def galactic_share(theta: Vector, phi: Vector) -> Vector:
     theta, phi : (points,) array
         Galactic, in radians; theta from the north pole.
     """
-    slabs, places = _towards(theta, phi)
-    synchrotron, depth = slabs.synchrotron(MAXIMUM_MHZ)
+    synchrotron, depth = _synchrotron(MAXIMUM_MHZ, theta, phi)
     whole = brightness(synchrotron, depth, MAXIMUM_MHZ)
-    return (1.0 - background(MAXIMUM_MHZ) * np.exp(-depth) / whole)[places]
+    return 1.0 - background(MAXIMUM_MHZ) * np.exp(-depth) / whole
 
 
 def diffuse_brightness(frequency_mhz: float, theta: Vector, phi: Vector) -> Vector:
@@ -721,5 +723,4 @@ def diffuse_brightness(frequency_mhz: float, theta: Vector, phi: Vector) -> Vect
     theta, phi : (points,) array
         Galactic, in radians; theta from the north pole.
     """
-    slabs, places = _towards(theta, phi)
-    return brightness(*slabs.synchrotron(frequency_mhz), frequency_mhz)[places]
+    return brightness(*_synchrotron(frequency_mhz, theta, phi), frequency_mhz)

@@ -6,7 +6,7 @@ is not an error.
 
 Kinds: correlated coefficients, S = G G^T as a matrix; independent unknowns, S = diag(widths^2); an
 isotropic Gaussian sky in real harmonic coefficients, S = diag(C_ell). C_ell can be read from a
-text file, a mean sky from a FITS map.
+text file.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import Described, extent, is_traced, require_array, require_whole
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import LARGEST_LMAX, n_modes, per_mode
+from lusee_bayes.core.harmonics import LARGEST_LMAX, per_mode
 from lusee_bayes.core.layouts import Layout, Variable
-from lusee_bayes.core.reading import read_text, reading, require_file
-from lusee_bayes.sky.sky_source import read_sky_file
+from lusee_bayes.core.reading import read_text, reading
 
 Unknowns = Float[Array, " unknowns"]
 Covered = Float[Array, "unknowns unknowns"]
@@ -361,10 +360,6 @@ class HarmonicPrior(DiagonalPrior):
         root = xp.sqrt(xp.where(power, self.spectrum, 1.0))
         return per_mode(xp.where(power, root, 0.0))
 
-    @property
-    def size(self) -> int:
-        return n_modes(self.spectrum.shape[0] - 1)
-
     def widened(self, factor):
         return HarmonicPrior(self.spectrum * factor**2, mean=self.mean)
 
@@ -434,28 +429,3 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
     if not (spectrum := checked["C_ell"][: lmax + 1]).any():
         raise InputError(f"{path}: C_ell is zero at every ell up to {lmax}; a prior needs variance")
     return spectrum
-
-
-def read_mean(path: str | Path, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
-    """Read a prior's mean sky: a HEALPix FITS map, or any other file of skies.
-
-    Parameters
-    ----------
-    path : str or Path
-    frequency_mhz : float
-        For files that state their frequencies.
-    lmax : int
-        Highest ell of the coefficients to use.
-
-    Returns
-    -------
-    (modes,) array
-        Galactic, real packed, in K.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be used, or is too coarse.
-    """
-    path = require_file(path, "mean map of the prior", "check prior.mean_file")
-    return read_sky_file(path).modes_at(frequency_mhz, lmax)

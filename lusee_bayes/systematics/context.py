@@ -77,8 +77,9 @@ class Setup:
     sky : Sky
         The scenario's model sky, up to lmax.
     beam_source : BeamSource
-    instrument : Instrument
-        Orientations and samples, which give A for any beams.
+    expected_source : BeamSource
+        The antennas with the expected values of their parameters; those of ``beam_source`` may be
+        true ones.
     beams : ProductBeams
     coupling : CouplingMatrix
         A.
@@ -109,7 +110,7 @@ class Setup:
     observation: Observation
     sky: Sky
     beam_source: BeamSource
-    instrument: Instrument
+    expected_source: BeamSource
     beams: ProductBeams
     coupling: CouplingMatrix
     prior: Prior
@@ -131,12 +132,18 @@ class Setup:
     @property
     def pointing(self) -> Pointing:
         """The orientation of the lander at every sample."""
-        return self.instrument.pointing
+        return self.coupling.pointing
 
     @property
     def layout(self) -> DataLayout:
         """The product and the time of every datum."""
         return self.coupling.layout
+
+    @property
+    def instrument(self) -> Instrument:
+        """Expected antennas, orientations and samples, which give A for any beams."""
+        of_data = self.pointing, self.layout, self.frequency_mhz, self.scenario.lmax
+        return Instrument(self.expected_source, *of_data)
 
     @property
     def offset(self) -> DataVector | None:
@@ -181,9 +188,8 @@ class Setup:
 
     def with_layout(self, layout: DataLayout) -> Setup:
         """Return the same for a subset of its data."""
-        instrument = replace(self.instrument, layout=layout)
-        coupling, above = replace(self.coupling, layout=layout), self._above_at(layout)
-        return replace(self, instrument=instrument, coupling=coupling, above=above)
+        coupling = replace(self.coupling, layout=layout)
+        return replace(self, coupling=coupling, above=self._above_at(layout))
 
     def _above_at(self, layout: DataLayout, keep: Any = np.s_[:]) -> Above | None:
         """The sky above lmax in the data of another layout, which has only the times ``keep``."""
@@ -200,19 +206,29 @@ class Setup:
         of_time = {"azimuth": turns.azimuth[keep], "functions": turns.functions[keep]}
         pointing = replace(turns, **of_time, run_starts=tuple(ends))
         layout = DataLayout.from_flags(~np.asarray(self.layout.present)[:, keep])
-        moved = {"pointing": pointing, "layout": layout}
         calibration = self.calibration
         return replace(
             self,
             observation=observation,
-            instrument=replace(self.instrument, **moved),
-            coupling=replace(self.coupling, **moved),
+            coupling=replace(self.coupling, pointing=pointing, layout=layout),
             responses=tuple(grid[:, keep] for grid in self.responses),
             background=self.background[:, keep],
             signal=self.signal[:, keep],
             calibration=None if calibration is None else calibration.select(keep),
             above=self._above_at(layout, keep),
         )
+
+    @property
+    def n_averaged(self) -> Float[Array, " times"]:
+        """Number of independent samples in a visibility of every time.
+
+        Averages of spectra contain it; for other data, it follows from the scenario's bandwidth and
+        duty cycle.
+        """
+        if self.calibration is not None:
+            return self.calibration.n_averaged
+        section = self.scenario.noise.radiometer
+        return section.bandwidth_hz * self.observation.live_s * section.duty_cycle
 
     @property
     def has_autos(self) -> bool:

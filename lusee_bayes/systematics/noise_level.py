@@ -91,11 +91,6 @@ def radiometer_about(setup: Setup) -> NoiseAbout:
 
 def common_bias(setup: Setup) -> float:
     """How far noise in measured visibilities moves a common amplitude, in standard deviations."""
-    section, observation = setup.scenario.noise.radiometer, setup.observation
-    if setup.calibration is not None:
-        samples = np.asarray(setup.calibration.n_averaged)
-    else:
-        samples = section.bandwidth_hz * section.duty_cycle * np.asarray(observation.live_s)
-    n_antennas = setup.beam_source.n_ports
-    ratio = section.factor * observation.n_times / float(np.median(samples))
+    n_antennas, factor = setup.beam_source.n_ports, setup.scenario.noise.radiometer.factor
+    ratio = factor * setup.observation.n_times / np.median(setup.n_averaged)
     return float(4.0 * n_antennas * np.sqrt(ratio))

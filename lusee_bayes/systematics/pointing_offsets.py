@@ -144,21 +144,16 @@ class PointingOffsets(Systematic):
         back = {name: -value for name, value in values.items() if name not in CLOCK}
         observation = with_offsets(setup.observation, back)
         pointing = setup.pointing.placed(observation)
-        offsets = cls(
+        ignored = not setup.responses or setup.scenario.sources.treatment == "ignored"
+        return cls(
             tuple(Unknown(name, 0.0, std) for name, std in stds.items()),
             np.array([values.get(name, 0.0) for name in CLOCK]),
             pointing,
             setup.observation.hours,
             observation.lander_from_mcmf().T,
             setup.layout,
+            None if ignored else MovingSources.of(setup),
         )
-        if not setup.responses or setup.scenario.sources.treatment == "ignored":
-            return offsets
-        # the setup's signal already contains its sources
-        sources = MovingSources.of(setup)
-        orientation = offsets.orientation(dict.fromkeys(stds, 0.0) | dict(values))
-        seen = np.asarray(sources.seen(orientation, setup.layout))
-        return replace(offsets, sources=replace(sources, in_signal=seen))
 
     @classmethod
     def moved(cls, section: PointingSection, setup: Setup, values: Values) -> Setup:
@@ -264,7 +259,7 @@ class MovingSources(eqx.Module):
         Of each in the mean over its sample.
     monopoles : Monopoles
     frequency_mhz : float
-    in_signal : (data,) array or None
+    in_signal : (data,) array
         Their part of the data that the signal already contains, in K.
     """
 
@@ -275,7 +270,7 @@ class MovingSources(eqx.Module):
     weight: Float[Array, " instants"]
     monopoles: Monopoles
     frequency_mhz: float = eqx.field(static=True)
-    in_signal: Float[Array, " data"] | None = None
+    in_signal: Float[Array, " data"]
 
     @classmethod
     def of(cls, setup: Setup) -> MovingSources:
@@ -284,14 +279,16 @@ class MovingSources(eqx.Module):
         sections = setup.scenario.sources.list
         vectors = [np.broadcast_to(s.direction(instants), (len(sample), 3)) for s in sections]
         circular = np.array([s.stokes_v for s in sections])
+        fluxes = np.array([s.mean_flux(setup.frequency_mhz) for s in sections])
         return cls(
             np.einsum("tij,stj->sti", instants.mcmf_from_galactic, np.stack(vectors)),
-            np.array([s.mean_flux(setup.frequency_mhz) for s in sections]),
+            fluxes,
             circular if circular.any() else None,
             sample,
             weight,
             setup.beam_source.monopoles,
             setup.beams.frequency_mhz,
+            setup.layout.gather(np.tensordot(fluxes, np.stack(setup.responses), 1)),
         )
 
     def seen(self, orientation: Float[Array, "times 3 3"], layout: DataLayout) -> DataVector:
@@ -322,7 +319,6 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
     return replace(
         setup,
         observation=observation,
-        instrument=replace(setup.instrument, pointing=pointing),
         coupling=setup.coupling.of(pointing=pointing),
         responses=source_responses(*inputs),
     ).with_signal()

@@ -17,12 +17,9 @@ from pydantic import Field
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import Positive, Section, requires
-from lusee_bayes.sky.prior import HarmonicPrior
+from lusee_bayes.sky.prior import PIVOT, HarmonicPrior
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import Scale, Truth, Unknown
-
-# the ell at which the amplitude of the spectrum is defined, plus one
-PIVOT = 10.0
 
 
 class SpectrumSection(Section):

@@ -152,10 +152,8 @@ class PointSources(Systematic):
     def build(cls, section: SourcesSection, setup: Setup, around: Around) -> PointSources:
         columns, unknowns = [], []
         for one, response in zip(section.list, setup.responses, strict=True):
-            block, flux = (
-                one.blocks(setup.observation),
-                np.float64(one.mean_flux(setup.frequency_mhz)),
-            )
+            flux = np.float64(one.mean_flux(setup.frequency_mhz))
+            block = one.blocks(setup.observation)
             n_blocks = int(block.max()) + 1
             for number in range(n_blocks):
                 columns.append(setup.layout.gather(np.where(block == number, response, 0.0)))

@@ -343,11 +343,6 @@ class Systematic(eqx.Module):
         return np.asarray(jax.random.normal(key, (len(self.names),)))
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        """Names in words."""
-        return tuple(name.replace("_", " ") for name in self.names)
-
-    @property
     def means(self) -> Vector:
         """Prior means, in the units of the names."""
         return np.concatenate([np.full(u.size or 1, float(u.mean)) for u in self.unknowns])
@@ -387,7 +382,8 @@ class Systematic(eqx.Module):
 
     def like_the_sky(self) -> tuple[tuple[str, ...], Float[np.ndarray, "parts n"]]:
         """Parts of it that may look like a uniform sky: words, and unit vectors of its unknowns."""
-        return self.labels, np.eye(len(self.names))
+        labels = tuple(name.removesuffix("_k").replace("_", " ") for name in self.names)
+        return labels, np.eye(len(labels))
 
     # --- its effect ---
 
@@ -717,10 +713,6 @@ class Temperatures(Systematic):
 
     unknowns: tuple[Unknown, ...] = eqx.field()
     per_kelvin: Float[Array, "data n"]
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(name.removesuffix("_k").replace("_", " ") for name in self.names)
 
     def effect(self, model, values):
         """Add the emission of their deviations from the means."""
