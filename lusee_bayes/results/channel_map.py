@@ -183,14 +183,11 @@ class Conditioned:
 
     def log_likelihood(self) -> Float[np.ndarray, " n"]:
         """ln p(d | m) of these data for every draw."""
-        model, data = self.from_data.model, self.experiment.data.data
         if not len(self.draws):
             return np.zeros(0)
-        # factorised once: this takes far longer than a prediction if N couples times
-        factor = model.noise.factor()
-        white = [factor.whiten(data - model.predict(sky)) for sky in self.draws]
-        chi2 = np.array([float(one @ one) for one in white])
-        return -0.5 * (chi2 + float(factor.log_det()) + model.n_data * np.log(2.0 * np.pi))
+        solution = self.from_data.solution
+        # without the correction for unknowns whose prior means have moved
+        return solution.information.log_likelihood(self.draws) - 0.5 * solution.excess
 
     def of_all(self, data: ChannelData) -> ChannelData:
         """Replace n_data and chi^2 by those of all data, which a joint posterior uses."""
