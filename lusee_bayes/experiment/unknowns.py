@@ -28,7 +28,7 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
-from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, Square, Vector
+from lusee_bayes.core.arrays import DataVector, Modes, ModesMatrix, Pixels, Square, Vector
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, radiometer, true_values
@@ -531,9 +531,16 @@ def _table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     table = _alone(experiment, inference, inference.offsets)
     shares = np.asarray(table["std"] / table["prior_std"])  # remaining uncertainty of the offsets
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
-    model = base_model(experiment.setup)
-    left = inference.offsets.systematic.beyond_first_order(model, inference.posterior.mean, shares)
-    beyond = [float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in table["unknown"]]
+    model, mean = base_model(experiment.setup), inference.posterior.mean
+    offsets = inference.offsets.systematic
+
+    def seen(z: Vector) -> DataVector:
+        return np.asarray(offsets.effect(model, offsets.values(z)).predict(mean))
+
+    # the mean of steps to either side has no first order
+    middle = seen(0.0 * shares)
+    left = [(seen(z) + seen(-z)) / 2.0 - middle for z in np.diag(shares)]
+    beyond = [float(np.sqrt(np.mean((one / noise) ** 2))) for one in left]
     table = table.assign(beyond_first_order=beyond).rename(columns={"unknown": "offset"})
     return table.filter(["offset", "value", "std", "prior_std", "beyond_first_order", "true"])
 

@@ -410,16 +410,12 @@ DEPTH_KPC = 50.0
 TOP_KPC = 10.0
 
 
-def emissivity_in_plane(radius_kpc: np.ndarray) -> np.ndarray:
-    """Compute the mid-plane synchrotron emissivity at 408 MHz in K/kpc, at radii in kpc."""
+def emissivity(radius_kpc: np.ndarray, z_kpc: np.ndarray) -> np.ndarray:
+    """Compute the synchrotron emissivity at 408 MHz in K/kpc, at radii and heights in kpc."""
     log_scaled = np.log((radius_kpc + EMISSIVITY_CORE_KPC) / EMISSIVITY_RADIUS_KPC)
     exponent = EMISSIVITY_RADIAL_INDEX * log_scaled - radius_kpc / EMISSIVITY_RADIUS_KPC
-    return EMISSIVITY_K_PER_KPC * np.exp(exponent)
-
-
-def emissivity_height_profile(z_kpc: np.ndarray) -> np.ndarray:
-    """Compute the emissivity at heights in kpc over its mid-plane value."""
-    return np.exp(-((np.abs(z_kpc) / EMISSIVITY_HEIGHT_KPC) ** EMISSIVITY_HEIGHT_INDEX))
+    height = (np.abs(z_kpc) / EMISSIVITY_HEIGHT_KPC) ** EMISSIVITY_HEIGHT_INDEX
+    return EMISSIVITY_K_PER_KPC * np.exp(exponent) * np.exp(-height)
 
 
 def background(frequency_mhz: float) -> float:
@@ -490,7 +486,7 @@ class Slabs:
             radius = np.sqrt(SUN_RADIUS_KPC**2 + along * (along - 2.0 * SUN_RADIUS_KPC * cos_lon))
             n_squared = thick_disc(radius) * height_profile(z, THICK_HEIGHT_KPC)
             n_squared = n_squared + thin_disc(radius) * height_profile(z, THIN_HEIGHT_KPC)
-            disc = emissivity_in_plane(radius) * emissivity_height_profile(z) * ds
+            disc = emissivity(radius, z) * ds
             emitted[k], smooth = disc[of_line], n_squared[of_line]
 
             # Each region counts by the exact share of the slab inside it, to avoid ragged outlines.

@@ -426,27 +426,6 @@ class Systematic(eqx.Module):
 
         return columns
 
-    def beyond_first_order(
-        self, model: LinearGaussian, sky: Modes, z: Vector
-    ) -> dict[str, DataVector]:
-        """Effect of each unknown on the data beyond first order, in K, by name.
-
-        Parameters
-        ----------
-        model : LinearGaussian
-            Without it.
-        sky : (modes,) array
-            In K.
-        z : (n,) array
-            Deviation of each to either side, in prior standard deviations.
-        """
-
-        def seen(way: Vector) -> DataVector:
-            return np.asarray(self.effect(model, self.values(way)).predict(sky))
-
-        middle, ways = seen(0.0 * z), zip(self.names, np.diag(z), strict=True)
-        return {name: (seen(way) + seen(-way)) / 2.0 - middle for name, way in ways}
-
     def behind(self, gains: DataVector) -> Systematic:
         """The same with its term of N multiplied by later gains; by default unchanged.
 
