@@ -34,8 +34,6 @@ from lusee_bayes.systematics.systematic import LowRankNoise, with_added
 
 # largest change of chi^2 by all omitted directions together
 LEFT_OUT = 1.0
-# number of directions in a block
-BLOCK = 256
 
 
 class AboveLmaxSection(Section):
@@ -136,25 +134,11 @@ def sky_above(setup: Setup, noise: Factor, learned: ModesMatrix | None = None) -
 
 
 def _main_directions(white: Float[np.ndarray, "data modes"]) -> Float[np.ndarray, "modes few"]:
-    """Orthonormal directions beyond which the squares of a matrix add up to less than LEFT_OUT.
-
-    They are found among its images of random vectors (Halko, Martinsson & Tropp 2011, SIAM Review
-    53, 217), block by block; what the blocks leave out is known exactly.
-    """
-    (rows, modes), total, rng = white.shape, float(np.vdot(white, white)), np.random.default_rng(0)
-    q, inside = np.zeros((rows, 0)), np.zeros((0, modes))
-    while total - np.vdot(inside, inside) >= LEFT_OUT and len(inside) < min(rows, modes):
-        images = white @ rng.standard_normal((modes, min(BLOCK, min(rows, modes) - len(inside))))
-        for _ in range(2):  # the second time for the largest directions beyond q
-            for _ in range(2):  # the second time against rounding
-                images = np.linalg.qr(images - q @ (q.T @ images))[0]
-            products = images.T @ white
-            block, images = images, white @ products.T
-        q, inside = np.hstack([q, block]), np.vstack([inside, products])
-    basis, triangle = np.linalg.qr(inside.T)
-    vectors, singular, _ = np.linalg.svd(triangle)
-    n = np.searchsorted(np.append(0.0, np.cumsum(singular**2)), total - LEFT_OUT)
-    return basis @ vectors[:, :n]
+    """The fewest orthonormal directions that leave less than LEFT_OUT of a matrix's squares."""
+    # in a basis with no more directions than there are data
+    basis, triangle = np.linalg.qr(white.T)
+    squares, directions = np.linalg.eigh(triangle @ triangle.T)
+    return basis @ directions[:, np.searchsorted(np.cumsum(squares), LEFT_OUT) :]
 
 
 def _coupling(setup: Setup, lmax: int) -> Float[np.ndarray, "data modes"]:
