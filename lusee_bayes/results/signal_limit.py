@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebvander
-from scipy.optimize import least_squares
+from scipy.optimize import curve_fit
 from scipy.stats import foldnorm
 
 from lusee_bayes.core.arrays import Square, Vector
@@ -135,30 +135,25 @@ def signal_limit(
         )
     if not (np.isfinite(y) & (y > 0.0)).all():
         raise InputError(f"the {region} has temperatures that are not positive")
-    whitener = np.linalg.inv(
-        checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
-    )
+    checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
 
-    def sky(values: Vector) -> Frequencies:
-        return np.exp(smooth @ values[:-1])
+    def modelled(_: Frequencies, *values: float) -> Frequencies:
+        return np.exp(smooth @ values[:-1]) + values[-1] * t
 
-    def slopes(values: Vector) -> Float[np.ndarray, "frequency columns"]:
-        return np.column_stack([sky(values)[:, None] * smooth, t])
+    def slopes(_: Frequencies, *values: float) -> Float[np.ndarray, "frequency columns"]:
+        return np.column_stack([np.exp(smooth @ values[:-1])[:, None] * smooth, t])
 
     start = np.append(np.linalg.lstsq(smooth, np.log(y), rcond=None)[0], 0.0)
-    solution = least_squares(
-        lambda values: whitener @ (sky(values) + values[-1] * t - y),
-        start,
-        lambda values: whitener @ slopes(values),
-        x_scale="jac",
-        **dict.fromkeys(("ftol", "xtol", "gtol"), SETTLED),
-    )
-    if not solution.success:
-        raise InputError(f"the smooth spectrum of the {region} does not converge; lower --order")
-    amplitude, off = float(solution.x[-1]), solution.fun
+    given = modelled, f, y, start, spectrum.covariance[k]
+    options = {"jac": slopes, "x_scale": "jac", "method": "trf", "full_output": True}
+    options |= dict.fromkeys(("ftol", "xtol", "gtol"), SETTLED)
+    no_fit = f"the smooth spectrum of the {region} does not converge; lower --order"
+    with refusing(no_fit, RuntimeError):
+        values, _, found, *_ = curve_fit(*given, absolute_sigma=True, **options)
+    amplitude, off = float(values[-1]), found["fvec"]
 
     def error_under(covariance: Square) -> float:
-        columns = slopes(solution.x)
+        columns = slopes(f, *values)
         normal = columns.T @ np.linalg.solve(covariance, columns)
         return float(np.sqrt(np.linalg.inv(normal)[-1, -1]))
 

@@ -250,9 +250,8 @@ class SkySpectrum:
         first = channels[0]
         std, common = np.stack([c.std for c in channels]), np.stack([c.common for c in channels])
         if len(first.draws):
-            drawn = np.stack([c.draws for c in channels])
-            pulls = (drawn - drawn.mean(1, keepdims=True)) / drawn.std(1, keepdims=True)
-            correlation = np.einsum("fdr,gdr->rfg", pulls, pulls) / drawn.shape[1]
+            drawn = np.stack([c.draws.T for c in channels], axis=1)
+            correlation = np.stack([np.atleast_2d(np.corrcoef(of_region)) for of_region in drawn])
             covariance = correlation * np.einsum("fr,gr->rfg", std, std)
         else:
             errors = np.stack([c.departure.error for c in channels])
@@ -357,10 +356,9 @@ class IndexMaps:
         positive = (draws > 0.0).all(0)
         log = np.log(np.where(positive, draws, 1.0))
         relative = draws.std(1) / draws.mean(1)
-        design = np.stack([np.ones_like(x), x, x**2], axis=1)[None] / relative.T[..., None]
-        normal = np.einsum("pfi,pfj->pij", design, design)
-        pulls = np.einsum("pfi,fdp->pid", design, log / relative[:, None])
-        _, b, c = np.linalg.solve(normal, pulls).swapaxes(0, 1)  # (cells, draws) each
+        cells = zip(np.moveaxis(log, 2, 0), 1.0 / relative.T, strict=True)
+        fits = [np.polyfit(x, of_cell, 2, w=weight) for of_cell, weight in cells]
+        c, b, _ = np.stack(fits, axis=1)  # (cells, draws) each
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
             turnover = reference * np.exp(-b / (2.0 * c))
         inside = (turnover >= frequencies_mhz.min()) & (turnover <= frequencies_mhz.max())
