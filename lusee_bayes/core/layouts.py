@@ -155,11 +155,14 @@ class Content:
         Declared attributes, without absent optional ones.
     sizes : dict of str to int
         Lengths of dimensions by name.
+    names : frozenset of str
+        Names of all arrays of the file, declared or not.
     """
 
     arrays: dict[str, np.ndarray]
     values: dict[str, Any]
     sizes: dict[str, int]
+    names: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -226,7 +229,7 @@ class Layout:
             factor = factor_to(f"{path}: {name}", declared.unit, values.get(f"{name}.units"))
             array = np.asarray(arrays[name])
             read[name] = _checked_array(f"{path}: {name}", array, declared, factor)
-        return Content(read, attributes, sizes)
+        return Content(read, attributes, sizes, frozenset(map(str, arrays)))
 
 
 def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str, int]) -> None:
