@@ -259,14 +259,12 @@ class LogNormalSky(eqx.Module):
             In K.
         """
         white, root = np.asarray(white), np.asarray(self.root())
-        matrix = np.empty((self.n_modes, self.size))
         product = self.grid.product_matrix(np.asarray(self.diffuse(white)))
-        np.multiply(product, root[None, : self.n_modes], out=matrix[:, : self.n_modes])
+        product *= root[None, : self.n_modes]
         eta = white[self.n_modes :]
         # g' = phi(eta) / Phi(-eta)
         slope = np.exp(-0.5 * eta**2 - log_ndtr(-eta)) / np.sqrt(2.0 * np.pi)
-        matrix[:, self.n_modes :] = np.asarray(self.source_modes).T * slope
-        return matrix
+        return np.hstack([product, np.asarray(self.source_modes).T * slope])
 
 
 # factors of the fields in the logarithm: x is frequency / reference, y frequency / turnover

@@ -25,7 +25,7 @@ from lusee_bayes.instrument.beams.source import BeamSource, Receiver
 from lusee_bayes.instrument.coupling import CouplingMatrix, Instrument
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.products import DataLayout, all_products, auto_indices, without_gaps
+from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, without_gaps
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.sky.prior import Prior
@@ -234,9 +234,9 @@ class Setup:
     def has_autos(self) -> bool:
         """Whether every port that was used has its auto at some time."""
         seen, n = np.asarray(self.layout.present).any(1), self.beam_source.n_ports
-        products = np.array(all_products(n), dtype=object)
-        used = set(products[seen, :2].ravel())
-        return all(seen[k] for port, k in enumerate(auto_indices(n)) if port in used)
+        first, second, _ = ports(n)
+        used = np.union1d(first[seen], second[seen])
+        return bool(seen[auto_indices(n)[used]].all())
 
 
 def prior_and_family(scenario: Any, sky: Sky) -> tuple[Prior, PriorFamily | None]:

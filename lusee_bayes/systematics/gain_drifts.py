@@ -385,7 +385,7 @@ class GainCoordinates(Chart):
         return len(self.names) > 2
 
     def to_values(self, x):
-        values, noise, log_det = dict(x), x[GAIN_NOISE], jnp.zeros(())
+        values, noise = dict(x), x[GAIN_NOISE]
         mean, constant = self._shared()
         scale = (mean * noise).sum()
         noise = jnp.exp(scale) * (noise + (1.0 - scale) * constant) - constant
