@@ -453,8 +453,8 @@ class Slabs:
     ----------
     emitted : (slabs, lines) array
         Brightness of each slab at 408 MHz without absorption, in K.
-    column : (slabs, lines) array
-        int n_e^2 ds of each slab in cm^-6 kpc.
+    column : (slabs, 2, lines) array
+        int n_e^2 ds of each slab in cm^-6 kpc, at ``+|latitude|`` and ``-|latitude|``.
     """
 
     emitted: np.ndarray
@@ -462,16 +462,23 @@ class Slabs:
 
     @classmethod
     def towards(cls, lon_deg: np.ndarray, lat_deg: np.ndarray) -> Slabs:
-        """Compute slabs for Galactic directions (lines,) in degrees."""
-        lon, lat = np.radians(lon_deg), np.radians(lat_deg)
+        """Compute slabs for Galactic directions (n,) in degrees, at both signs of ``lat_deg``."""
+        lon, lat = np.radians(lon_deg), np.radians(np.abs(lat_deg))
         cos_lon, cos_lat, sin_lat = np.cos(lon), np.cos(lat), np.sin(lat)
-        direction = np.stack([np.sin(lon) * cos_lat, -cos_lon * cos_lat, sin_lat], axis=-1)
+        up = np.stack([np.sin(lon) * cos_lat, -cos_lon * cos_lat, sin_lat], axis=-1)
+        direction = np.stack([up, up * [1.0, 1.0, -1.0]])
         chords = [(region.chord(direction), region) for region in REGIONS]
 
+        # The discs are symmetric in l: they are computed once for l and -l.
+        places = np.round(np.stack([cos_lon, sin_lat]), 12)
+        _, one, of_line = np.unique(places, axis=1, return_index=True, return_inverse=True)
+        cos_lon, cos_lat, sin_lat = cos_lon[one], cos_lat[one], sin_lat[one]
+        of_line = of_line.ravel()
         # Near a pole the same panels are shortened, so that the discs stay resolved.
-        stretch = np.minimum(1.0, TOP_KPC / DEPTH_KPC / np.maximum(np.abs(sin_lat), 1e-9))
+        stretch = np.minimum(1.0, TOP_KPC / DEPTH_KPC / np.maximum(sin_lat, 1e-9))
         nodes, weights = _nodes()
-        emitted, column = np.empty((2, len(nodes), len(lon)))
+        emitted = np.empty((len(nodes), len(lon)))
+        column = np.empty((len(nodes), 2, len(lon)))
         near = 0.0
         for k, (node, weight) in enumerate(zip(nodes, weights, strict=True)):
             s, ds = node * stretch, weight * stretch
@@ -479,24 +486,25 @@ class Slabs:
             radius = np.sqrt(SUN_RADIUS_KPC**2 + along * (along - 2.0 * SUN_RADIUS_KPC * cos_lon))
             n_squared = thick_disc(radius) * height_profile(z, THICK_HEIGHT_KPC)
             n_squared = n_squared + thin_disc(radius) * height_profile(z, THIN_HEIGHT_KPC)
-            emitted[k] = emissivity(radius, z) * ds
+            disc = emissivity(radius, z) * ds
+            emitted[k], smooth = disc[of_line], n_squared[of_line]
 
             # Each region counts by the exact share of the slab inside it, to avoid ragged outlines.
-            begin = near * stretch
+            begin, length = (near * stretch)[of_line], ds[of_line]
             near = near + weight
             left, local = 1.0, 0.0
             for (enter, leave), region in chords:
                 if begin.min() > leave.max():  # beyond it
                     continue
-                overlap = np.minimum(leave, begin + ds) - np.maximum(enter, begin)
-                share = left * np.maximum(overlap, 0.0) / ds
+                overlap = np.minimum(leave, begin + length) - np.maximum(enter, begin)
+                share = left * np.maximum(overlap, 0.0) / length
                 local = local + share * region.n_squared_cm6
                 left = left - share
-            column[k] = ds * (left * n_squared + local)
+            column[k] = length * (left * smooth + local)
         return cls(emitted, column)
 
     def synchrotron(self, frequency_mhz: float) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the synchrotron emission in K and the total optical depth, both (lines,).
+        """Compute the synchrotron emission in K and the total optical depth, both (2, lines).
 
         Parameters
         ----------
@@ -536,15 +544,22 @@ def brightness(synchrotron: np.ndarray, depth: np.ndarray, frequency_mhz: float)
 
 def _synchrotron(frequency_mhz: float, theta: Vector, phi: Vector) -> tuple[Vector, Vector]:
     """Synchrotron emission in K and total optical depth in Galactic directions, in radians."""
-    slabs = _slabs(np.stack([theta, phi]).astype(np.float64).tobytes())
-    return slabs.synchrotron(frequency_mhz)
+    slabs, places = _slabs(np.stack([theta, phi]).astype(np.float64).tobytes())
+    synchrotron, depth = slabs.synchrotron(frequency_mhz)
+    return synchrotron[places], depth[places]
 
 
 @lru_cache(maxsize=2)
-def _slabs(points: bytes) -> Slabs:
-    """Lines of sight, the same at all frequencies."""
+def _slabs(points: bytes) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
+    """Lines of sight, the same at all frequencies, and the side and line of each direction."""
     theta, phi = np.frombuffer(points).reshape(2, -1)
-    return Slabs.towards(np.degrees(phi), 90.0 - np.degrees(theta))
+    # lines of sight above and below the plane share their symmetric parts, computed once
+    key = np.abs(0.5 * np.pi - theta).round(12) + 1j * phi.round(12)
+    _, first, line = np.unique(key, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    one = first[order]
+    slabs = Slabs.towards(np.degrees(phi[one]), 90.0 - np.degrees(theta[one]))
+    return slabs, ((theta > 0.5 * np.pi).astype(int), np.argsort(order)[line])
 
 
 def _fluctuations(nside: int, seed: int) -> np.ndarray:

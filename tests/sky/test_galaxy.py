@@ -83,7 +83,8 @@ def one_line(lon_deg, lat_deg, frequency_mhz, electrons=1.0):
     slabs = galaxy.Slabs.towards(lon, lat)
     slabs = galaxy.Slabs(slabs.emitted, electrons * slabs.column)
     synchrotron, depth = slabs.synchrotron(frequency_mhz)
-    return synchrotron[0], depth[0]
+    row = 0 if lat_deg >= 0 else 1
+    return synchrotron[row, 0], depth[row, 0]
 
 
 def all_of_a_line(synchrotron, depth, frequency_mhz):
@@ -146,9 +147,10 @@ def test_with_electrons_it_is_that_of_tiny_steps(lon_deg, lat_deg, frequency_mhz
 
 def seen(emitted, column, frequency_mhz):
     """Brightness of one line through slabs: emission in K at 408 MHz, columns in cm^-6 pc."""
-    slabs = galaxy.Slabs(np.asarray(emitted)[:, None], np.asarray(column)[:, None] / 1e3)
+    columns = np.repeat(np.asarray(column)[:, None, None], 2, axis=1) / 1e3
+    slabs = galaxy.Slabs(np.asarray(emitted)[:, None], columns)
     synchrotron, depth = slabs.synchrotron(frequency_mhz)
-    return galaxy.brightness(synchrotron, depth, frequency_mhz)[0]
+    return galaxy.brightness(synchrotron, depth, frequency_mhz)[0, 0]
 
 
 @pytest.mark.parametrize("tau", [0.0, 1e-6, 0.1, 1.0, 3.0, 50.0])
