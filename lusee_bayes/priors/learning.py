@@ -48,7 +48,7 @@ from numpy.random import Generator
 
 from lusee_bayes.core.arrays import Draws, ModesMatrix, Square
 from lusee_bayes.core.engine import in_threads
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, refusing
 from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.measures import expected_chi2
@@ -135,6 +135,7 @@ SIMULATIONS, FINAL_SIMULATIONS = 200, 500
 ROUNDING = 1e-4
 # multiples of the factor of N that misfitting data demand, tried one after the other
 HIGHER = np.array([1.0, 1e2, 1e4])
+INFINITE = "the mean of a variance over the prior's uncertain parameters is infinite"
 # shifts of ln C at which the evidence of the averaged prior is computed, to find the best one
 LEVELS = (-1.0, -0.5, 0.0)
 # how often a fixed prior is widened tenfold if rounding prevents a posterior mean
@@ -241,8 +242,8 @@ def learn(
     Raises
     ------
     InputError
-        If S is not positive definite, the search does not converge in 60 steps, or ln p falls along
-        its gradient.
+        If S is not positive definite, the search does not converge in 60 steps, ln p falls along
+        its gradient, or the mean of a variance is infinite.
     """
     rng, path = np.random.default_rng(seed), []
     point = _at(family, information, family.hyperprior.start() if start is None else start)
@@ -378,7 +379,8 @@ def _learned(
 
     # S is a constant plus a part proportional to the level
     first = np.arange(len(mean)) == 0
-    once, twice = (family.averaged(mean + level * first, about) for level in (0.0, np.log(2.0)))
+    with np.errstate(over="raise"), refusing(INFINITE, FloatingPointError):
+        once, twice = (family.averaged(mean + level * first, about) for level in (0.0, np.log(2.0)))
 
     def at_level(shift: float) -> Posterior:
         covariance = once + np.expm1(shift) * (twice - once)
