@@ -50,7 +50,7 @@ SCALE_WIDTH = MONOPOLE_WIDTH = 1.0
 WEIGHT_WIDTH = 1.0
 # discs (FWHM) for spurs and clouds that nothing else names, and their usual strength over the
 # mean of the sky. Over 30 degrees GSM2008 departs from the template by 10 % of its mean, ULSA's
-# sky by 1 %. The last is the standard deviation of ln g_i^2
+# sky by 1 %. The last is the width of ln g_i^2
 DISCS_NSIDE, DISC_DEG, DISC_WIDTH, DISCS_WIDTH = 2, 30.0, 0.03, 1.0
 # C_ell of white errors, which every survey has: 0.1 % of the mean up to ell = 31, over C_0
 WHITE = 1e-6 / 1024
