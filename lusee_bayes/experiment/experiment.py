@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from lusee_bayes.core.arrays import Draws, on_device
+from lusee_bayes.core.arrays import Draws
 from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
@@ -254,7 +254,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
     When called, a function raises InputError for a systematic that the scenario also marginalises.
     """
-    setup, data, log_normal = experiment.setup, experiment.data, experiment.scenario.log_normal
+    setup, data = experiment.setup, experiment.data
 
     def require_free(cls: type[Systematic]) -> None:
         if cls.treatment(experiment.scenario) == "marginalised":
@@ -292,7 +292,6 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
         "gain_drifts": lambda: built(GainDrifts),
         "instrument": instrument,
         "sources": lambda: built(PointSources),
-        "log_normal": lambda: on_device(log_normal.prior(setup.sky.frequency_mhz, setup.sky.lmax)),
         "layout": lambda: data.layout,
     }
 

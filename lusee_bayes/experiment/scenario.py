@@ -176,8 +176,6 @@ class Scenario(Section):
         Point sources that are not part of the map.
     spectral : SpectralSection
         Prior on the skies of joint channels.
-    log_normal : LogNormalSection
-        Prior of the program ``log_normal``.
     flight : FlightSection
         Reduction of spectrometer sessions to visibilities.
     output : OutputSection
@@ -201,7 +199,6 @@ class Scenario(Section):
     noise: NoiseSection = NoiseSection()
     sources: SourcesSection = SourcesSection()
     spectral: sky_sections.SpectralSection = sky_sections.SpectralSection()
-    log_normal: sky_sections.LogNormalSection = sky_sections.LogNormalSection()
     flight: FlightSection | None = None
     output: OutputSection = OutputSection()
     seed: Seed = 1

@@ -24,10 +24,9 @@ from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, kinds_o
 from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.priors.surveys import Survey
-from lusee_bayes.sampling.log_normal_prior import LogNormalPrior
 from lusee_bayes.sky import sky_source
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, diffuse_brightness, galactic_share
-from lusee_bayes.sky.positive_skies import LogNormalSky, PositiveSkies, deviation_spectrum
+from lusee_bayes.sky.positive_skies import PositiveSkies
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_spectrum
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
@@ -180,9 +179,6 @@ SkySection = one_of(SKY_SECTIONS, _complete_sky, strict=False)
 
 # origin of C_ell
 LEARNED = "learned from these data"
-# prior of A and the tilt when sampled: centred on the values for relative deviations
-AMPLITUDE, TILT = 0.04, -2.5
-LOG_AMPLITUDE_STD, TILT_STD = 1.0, 0.5
 
 
 class IsotropicPriorSection(SpectrumSection):
@@ -319,47 +315,6 @@ def _complete_prior(tree: dict[str, Any]) -> None:
 
 
 PriorSection = one_of(PRIOR_SECTIONS, _complete_prior)
-
-
-class LogNormalSection(Section):
-    """The positive sky of the program ``log_normal``, which uses its own prior.
-
-    The sky is the embedded diffuse Galaxy times the exponential of a Gaussian field with
-    C_ell = A^2 ((ell + 1) / 10)^tilt. A and the tilt are fixed or sampled with the sky.
-
-    Attributes
-    ----------
-    amplitude : float
-        Amplitude A of ln(sky / Galaxy); if omitted, A and the tilt are sampled.
-    tilt : float
-        Slope of C_ell; required with ``amplitude``.
-    scale_std : float
-        Prior standard deviation of ln of the Galaxy's overall scale.
-    sources : bool
-        Include the catalogue's sources, each with a positive flux that may be small.
-    """
-
-    amplitude: Positive | None = None
-    tilt: Annotated[float, Field(ge=-20, le=20)] | None = None
-    scale_std: Positive = 0.5
-    sources: bool = True
-
-    _both_or_neither = requires(
-        lambda section: (section.amplitude is None) == (section.tilt is None),
-        "give both amplitude and tilt, or neither to sample them",
-    )
-
-    def prior(self, frequency_mhz: float, lmax: int) -> LogNormalPrior:
-        """The prior up to lmax."""
-        amplitude, tilt, std = AMPLITUDE, TILT, np.array([LOG_AMPLITUDE_STD, TILT_STD])
-        if self.amplitude is not None and self.tilt is not None:
-            amplitude, tilt, std = self.amplitude, self.tilt, None
-        level = np.array([4.0 * np.pi * self.scale_std**2])
-        spectrum = deviation_spectrum(lmax, amplitude, tilt, level)
-        sources = BRIGHT_SOURCES if self.sources else ()
-        template = partial(diffuse_brightness, frequency_mhz)
-        sky = LogNormalSky.of(template, spectrum, frequency_mhz, sources)
-        return LogNormalPrior(sky, np.array([np.log(amplitude), tilt]), std)
 
 
 # lmax of the fields of the logarithm, over the map's lmax

@@ -42,7 +42,6 @@ from lusee_bayes.sampling.datatree import read_datatree, to_datatree
 from lusee_bayes.sampling.distributions import TimesStudentT
 from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
 from lusee_bayes.sampling.least import require_draws, require_simulations
-from lusee_bayes.sampling.log_normal_program import coordinates_of
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program
 from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel
@@ -162,13 +161,10 @@ def coordinates(
     program: Program, arguments: dict, data: Visibilities, inference: Inference, latent: list[str]
 ) -> Whitening | None:
     """White coordinates for a program: of the analytic posterior if it samples only the sky and the
-    data are Gaussian about it, of :func:`.coordinates_of` for a log-normal sky, else about its
-    mode. None if no mode is found: warmup then learns scales."""
+    data are Gaussian about it, else about its mode. None if no mode is found: warmup then learns
+    scales."""
     if latent == [SKY] and not programs.predicts(program.model, arguments, TimesStudentT):
         return Whitening.of(inference.posterior)
-    positive = arguments.get("log_normal")
-    if positive is not None and set(latent) == set(positive.sites):
-        return coordinates_of(positive, inference.solution.information)
     start, arguments = start_values(inference, latent), {**arguments, "data": data.data}
     starts = 1 if SKY in latent else STARTS
     chart = _chart(arguments, latent)

@@ -70,8 +70,7 @@ PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
 
 # ... and of the experiment: the model without sampled systematics, these systematics, and the
 # product and time of every datum
-EXPERIMENT_PIECES = ("gaussian", "systematics", "gain_drifts", "instrument")
-EXPERIMENT_PIECES += ("sources", "log_normal", "layout")
+EXPERIMENT_PIECES = ("gaussian", "systematics", "gain_drifts", "instrument", "sources", "layout")
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,4 @@
-"""Positive skies: templates times the exponential of Gaussian fields, of one frequency or several.
-
-**One frequency**, with point sources::
-
-    m = P[T exp(Y a)] + sum_j F_j g(eta_j) y(n_j),    a ~ N(0, C_ell),    eta_j ~ N(0, 1)
-
-T is a template, Y synthesis on a grid, P integration with the harmonics of the map, and F_j the
-catalogued flux of a source in the direction n_j. With g(eta) = -ln Phi(-eta) its flux has an
-exponential distribution of mean F_j: it is positive and may be negligible. The unknowns are white:
-u = (xi, eta) ~ N(0, 1) with a = C^(1/2) xi.
-
-**Several frequencies**::
+"""Positive skies of several frequencies: templates times the exponential of Gaussian fields. ::
 
     ln m_f = ln T_f + w phi_f,    phi_f = a_0 + a_1 ln x + a_2 ln^2 x - a_3 y^-2.1 + r_f,
     x = nu / nu_ref,    y = nu / nu_turnover,
@@ -22,12 +11,12 @@ exponent of a channel is linear in them, and its sky is positive. About any expo
 
     dm_f = W d(phi),    W_ij = int y_i w T_f exp(w phi) y_j dOmega.
 
-**Power laws in ell** are the expected spectra of the logarithm, ::
+The expected spectrum of every field, and of every channel's residual, is a power law, ::
 
-    C_ell = A^2 ((ell + 1) / 10)^tilt,    ell > 0,
+    C_ell = A^2 ((ell + 1) / 10)^tilt,    ell > 0;
 
-of every field, too, and of every channel's residual; the mean over the sky has a separate width. A
-and tilt may be learned: ln A and tilt are normal around their expected values.
+the mean over the sky has a separate width. A and tilt may be learned: ln A and tilt are normal
+around their expected values.
 """
 
 from __future__ import annotations
@@ -36,16 +25,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
-from scipy.special import log_ndtr
 
-from lusee_bayes.core.arrays import Array, Vector, namespace
+from lusee_bayes.core.arrays import Array, Vector
 from lusee_bayes.core.checks import require_positive, require_shape
-from lusee_bayes.core.harmonics import n_modes, per_mode
+from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE, PointSource
+from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE
 from lusee_bayes.sky.prior import PIVOT
 from lusee_bayes.sky.spectral_prior import SpectralPrior, require_names
 
@@ -57,31 +44,10 @@ Pair = Float[np.ndarray, "2"]
 # a brightness temperature in K, of Galactic theta and phi in radians
 Template = Callable[[Vector, Vector], Vector]
 
+# band limit of the grid: this multiple of the fields'
+GRID = 3
 # steps of Newton's method, each of which approaches the root; largest change of a parameter
 NEWTON, REACH = 30, 2.0
-
-
-def deviation_spectrum(
-    lmax: int, amplitude: Number, tilt: Number, level: Float[Array, "1"]
-) -> Float[Array, " ells"]:
-    """Compute C_ell = A^2 ((ell + 1) / 10)^tilt of the logarithm of a sky over its template.
-
-    Parameters
-    ----------
-    lmax : int
-    amplitude, tilt : float or () array
-        A and the slope.
-    level : (1,) array
-        C_0: 4 pi times the variance of the logarithm of the template's scale.
-
-    Returns
-    -------
-    (ells,) array
-        Without unit.
-    """
-    xp = namespace(amplitude, tilt, level)
-    ell = np.arange(1.0, lmax + 1.0)
-    return xp.concatenate([level, amplitude**2 * ((ell + 1.0) / 10.0) ** tilt])
 
 
 def slopes(lmax: int) -> Float[np.ndarray, "2 ells"]:
@@ -113,158 +79,6 @@ def matching_step(
         curvature = 2.0 * (slope * np.maximum(scaled, known)) @ slope.T + np.diag(narrow)
         step = step + np.linalg.solve(curvature, slope @ (scaled - known) - narrow * (away + step))
     return np.clip(step, -REACH, REACH)
-
-
-# band limit of the grid for one frequency: this multiple of the map's, and at least LEAST_GRID,
-# since unresolved parts of the template fold back into the map
-GRID, LEAST_GRID = 3, 96
-
-
-class LogNormalSky(eqx.Module):
-    """The sky as a function of white unknowns; see the module's equations.
-
-    Attributes
-    ----------
-    spectrum : (ells,) array
-        C_ell of the logarithm, without unit, up to the map's lmax. The data resolve no more: twice
-        that changes ln evidence by 0.4 and standard deviations by 0.4 %.
-    grid : SphereGrid
-        Grid on which products are computed.
-    level : (rings, phi) array
-        T on the grid, in K.
-    source_modes : (sources, modes) array
-        F_j y(n_j), in K.
-    """
-
-    spectrum: Float[Array, " ells"]
-    grid: SphereGrid
-    level: Float[Array, "rings phi"]
-    source_modes: Float[Array, "sources modes"]
-
-    @classmethod
-    def of(
-        cls,
-        template: Template,
-        spectrum: Float[np.ndarray, " ells"],
-        frequency_mhz: float,
-        sources: tuple[PointSource, ...] = (),
-        *,
-        band: int | None = None,
-    ) -> LogNormalSky:
-        """Create the sky, in NumPy.
-
-        Parameters
-        ----------
-        template : callable
-            T in K, a function of Galactic theta and phi in radians, such as
-            :func:`.diffuse_brightness` at the frequency.
-        spectrum : (ells,) array
-            C_ell of the logarithm; its lmax is the map's.
-        frequency_mhz : float
-            Frequency of template and sources.
-        sources : tuple of PointSource
-        band : int, optional
-            Band limit of the grid; by default three times lmax, and at least 96.
-
-        Raises
-        ------
-        InputError
-            If the template is not positive everywhere, or the spectrum not at every ell.
-        """
-        lmax = len(spectrum) - 1
-        require_positive("the spectrum of the logarithm", spectrum)
-        grid = SphereGrid.of(lmax, max(GRID * lmax, LEAST_GRID) if band is None else band)
-        level = template(*grid.directions()).reshape(grid.shape)
-        require_positive("the template", level, "a log-normal sky is a positive template times exp")
-        modes = [source.modes(frequency_mhz, lmax) for source in sources]
-        shape = len(sources), n_modes(lmax)
-        return cls(np.asarray(spectrum), grid, level, np.reshape(modes, shape))
-
-    @property
-    def lmax(self) -> int:
-        """Highest ell of the map."""
-        return self.grid.lmax
-
-    @property
-    def n_modes(self) -> int:
-        """Number of modes of the map, and of xi."""
-        return n_modes(self.lmax)
-
-    @property
-    def size(self) -> int:
-        """Number of white unknowns: modes of the logarithm, then sources."""
-        return self.n_modes + len(self.source_modes)
-
-    def with_power_law(self, amplitude: Number, tilt: Number) -> LogNormalSky:
-        """Return the sky with C_ell = A^2 ((ell + 1) / 10)^tilt for ell > 0.
-
-        Parameters
-        ----------
-        amplitude, tilt : float or () array
-            A and the slope.
-        """
-        level = self.spectrum[:1]
-        return replace(self, spectrum=deviation_spectrum(self.lmax, amplitude, tilt, level))
-
-    def power_law_slopes(self) -> Float[np.ndarray, "2 modes"]:
-        """Return the derivatives of ln C_ell^(1/2) with respect to ln A and tilt, for all modes."""
-        slope = slopes(self.lmax)
-        slope[:, 0] = 0.0
-        return per_mode(slope)
-
-    def root(self) -> Float[Array, " unknowns"]:
-        """Return C^(1/2) of every mode of the logarithm, and 1 for every source."""
-        xp = namespace(self.spectrum)
-        return xp.concatenate([xp.sqrt(per_mode(self.spectrum)), np.ones(len(self.source_modes))])
-
-    def diffuse(self, white: White) -> Float[Array, "*batch rings phi"]:
-        """Compute T exp(Y a) on the grid, in K."""
-        root = self.root()[: self.n_modes]
-        logarithm = white[..., : self.n_modes] * root.reshape(*(1,) * (white.ndim - 1), -1)
-        field = namespace(self, white).exp(self.grid.synthesise(logarithm))
-        return field * self.level.reshape(*(1,) * (white.ndim - 1), *self.level.shape)
-
-    def source_factors(self, white: White) -> Float[Array, "*batch sources"]:
-        """Compute g(eta): fluxes of the sources relative to the catalogue."""
-        log_share = log_ndtr if namespace(white) is np else jax.scipy.special.log_ndtr
-        return -log_share(-white[..., self.n_modes :])
-
-    def modes(self, white: White) -> Float[Array, "*batch modes"]:
-        """Compute m.
-
-        Parameters
-        ----------
-        white : (..., unknowns) array
-            u.
-
-        Returns
-        -------
-        (..., modes) array
-            Real packed coefficients, Galactic, in K.
-        """
-        diffuse = self.grid.analyse(self.diffuse(white))
-        return diffuse + self.source_factors(white) @ self.source_modes
-
-    def jacobian(self, white: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "modes _"]:
-        """Compute dm/du as a matrix, in NumPy.
-
-        Parameters
-        ----------
-        white : (unknowns,) array
-            u.
-
-        Returns
-        -------
-        (modes, unknowns) array
-            In K.
-        """
-        white, root = np.asarray(white), np.asarray(self.root())
-        product = self.grid.product_matrix(np.asarray(self.diffuse(white)))
-        product *= root[None, : self.n_modes]
-        eta = white[self.n_modes :]
-        # g' = phi(eta) / Phi(-eta)
-        slope = np.exp(-0.5 * eta**2 - log_ndtr(-eta)) / np.sqrt(2.0 * np.pi)
-        return np.hstack([product, np.asarray(self.source_modes).T * slope])
 
 
 # factors of the fields in the logarithm: x is frequency / reference, y frequency / turnover
