@@ -17,7 +17,6 @@ from .noise.radiometer import radiometer_noise as radiometer_noise
 from .report.figures.maps import plot_map as plot_map
 from .results.finished_runs import read_draws as read_draws
 from .runs.compare_run import run_compare as run_compare
-from .runs.compare_run import run_compare_priors as run_compare_priors
 from .runs.data_run import run_average as run_average
 from .runs.data_run import run_reduce as run_reduce
 from .runs.data_run import run_simulate as run_simulate

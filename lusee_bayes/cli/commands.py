@@ -424,50 +424,6 @@ def compare_command(*folders: Path, options: Options = Options()) -> None:
     options.print(comparison_table(run.result), *lines, files=run.files)
 
 
-@app.command(name="compare-priors", group="Maps")
-def compare_priors_command(
-    scenario: str,
-    *,
-    truth: Flag = False,
-    priors: str | None = None,
-    options: DataOptions = DataOptions(),
-    engine: EngineOptions = EngineOptions(),
-) -> None:
-    """Map one data set under several priors and report which one the data prefer.
-
-    Results go to output/NAME-priors, or to the folder given by --output.
-
-    **Examples**
-
-    - ``lusee-bayes compare-priors fiducial --set lmax=31 -o output/priors``
-    - ``lusee-bayes compare-priors fiducial --data data.nc --priors isotropic,local_scales``
-
-    Parameters
-    ----------
-    scenario
-        YAML file, or name of a built-in scenario (fiducial, ...).
-    truth
-        Compute how often error bars cover the scenario's sky (use if the data were simulated from
-        it).
-    priors
-        Two or more, separated by commas: isotropic, isotropic-sky (C_ell of the scenario's sky;
-        simulated data only), local_scales. Default: all that apply. The scenario's prior section
-        sets the prior of its kind.
-    """
-    from lusee_bayes.cli.tables import table_of_numbers
-    from lusee_bayes.runs.compare_run import run_compare_priors
-    from lusee_bayes.runs.cost import demand_of
-
-    loaded = options.load(scenario)
-    names = None if priors is None else [n.strip() for n in priors.split(",") if n.strip()]
-    with engine.open(demand_of(loaded)) as opened:
-        folder = options.folder(scenario, "-priors")
-        given = {"truth": truth, "name": Path(scenario).stem, "engine": opened}
-        run = run_compare_priors(loaded, folder, names, **given, **options.running())
-    lines = [*run.result.lines(), f"look at {run.page}"]
-    options.print(table_of_numbers(*run.result.table()), *lines, files=run.files)
-
-
 @app.command(name="report", group="Results")
 def report_command(folder: Path, *, open: Flag = False, quiet: Quiet = False) -> None:
     """Rebuild report.html from the results in a run folder.
@@ -479,7 +435,7 @@ def report_command(folder: Path, *, open: Flag = False, quiet: Quiet = False) ->
     Parameters
     ----------
     folder
-        Results of map, sample, validate or compare-priors.
+        Results of map, sample or validate.
     open
         Open it in a browser.
     quiet

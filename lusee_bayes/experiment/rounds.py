@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lusee_bayes.core.arrays import DataVector, Grid, Modes, Vector
-from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
@@ -601,55 +600,3 @@ def learned_prior(setup: Setup, information: Information, start: Vector | None =
         coarse, learned = first_learned(setup, information)
         start = setup.family.start_from(coarse, learned.parameters) if learned.settled else None
     return learn_whatever_fits(setup.family, information, start, setup.scenario.seed)
-
-
-# uses C_ell of the scenario's sky, which is only known in simulations
-OF_TRUE_SKY = "isotropic-sky"
-NAMED: dict[str, sky_sections.PriorSection] = {
-    "isotropic": sky_sections.IsotropicPriorSection(),
-    OF_TRUE_SKY: sky_sections.IsotropicPriorSection(spectrum="sky"),
-    "local_scales": sky_sections.LocalScalesPriorSection(),
-}
-
-
-def named_priors(
-    names: Sequence[str] | None, scenario: Scenario, *, known_sky: bool
-) -> dict[str, sky_sections.PriorSection]:
-    """Find the sections of named priors.
-
-    If the scenario's own section has a named kind, it is used, including its template or amplitude.
-
-    Parameters
-    ----------
-    names : sequence of str or None
-        Two or more of ``isotropic`` (C_ell learned), ``isotropic-sky`` (C_ell of the scenario's
-        sky) and ``local_scales``; None for all that apply.
-    scenario : Scenario
-    known_sky : bool
-        Whether the data come from the scenario's sky.
-
-    Raises
-    ------
-    InputError
-        For an unknown or repeated name, for fewer than two, and for ``isotropic-sky`` if the sky is
-        not known.
-    """
-    if names is None:
-        names = [name for name in NAMED if known_sky or name != OF_TRUE_SKY]
-    for name in names:
-        require_known("--priors: no prior", name, NAMED)
-    if len(names) < 2 or len(set(names)) < len(names):
-        raise InputError(
-            f"--priors {','.join(names)}: give at least two different ones of {', '.join(NAMED)}"
-        )
-    if OF_TRUE_SKY in names and not known_sky:
-        raise InputError(
-            f"--priors: {OF_TRUE_SKY} needs C_ell of the scenario's sky, which is unknown for "
-            "measured data; omit it, or give --truth if the data were simulated from that sky"
-        )
-    given, named = scenario.prior, {name: NAMED[name] for name in names}
-    # isotropic priors differ in the origin of C_ell
-    return {
-        name: given if (given.model, given.origin) == (one.model, one.origin) else one
-        for name, one in named.items()
-    }

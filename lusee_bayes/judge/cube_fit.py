@@ -167,7 +167,7 @@ class ChannelFits:
         if level == "unlike the prior":
             return [
                 "Error bars may be too narrow where skies are brighter than the prior assumes, and "
-                "too wide elsewhere: choose another prior (lusee-bayes compare-priors)."
+                "too wide elsewhere: map with another prior (docs/howto/priors.md)."
             ]
         return []
 

@@ -3,8 +3,7 @@
 Let K = A S A^T + N be the covariance of data under the model, and u = K^-1 (d - E[d]). A group s
 differs from its prediction by K_ss^-1 u_s, where K_ss is a block of K^-1, and ::
 
-    chi^2_s = u_s^T K_ss^-1 u_s,
-    ln p(d_s | all others) = 1/2 [ln|K_ss| - chi^2_s - n_s ln 2 pi].
+    chi^2_s = u_s^T K_ss^-1 u_s.
 
 For noise alone, the mean of chi^2_s is the number of data, minus one for each direction of the sky
 that only this group measures: tr K_ss^-1 (K^-1 A S A^T K^-1)_ss in total.
@@ -28,7 +27,7 @@ products, or A has no structure in time, Y L^-T of all data is kept.
 **A large group** is removed from Q, without rows of A if A and N have structure in time::
 
     Q_s = Q - F^T D_:s D_ss^-1 D_s: F,    h = F^T D_:s D_ss^-1 u_s,
-    chi^2_s = u_s^T D_ss^-1 u_s + h^T Q_s^-1 h,    |K_ss| = |D_ss| |Q_s| / |Q|,
+    chi^2_s = u_s^T D_ss^-1 u_s + h^T Q_s^-1 h,
     directions = tr (Q_s^-1 - Q^-1) of the sky.
 
 The data that remain have N_0 without the group, so that D loses ``D_:s D_ss^-1 D_s:``.
@@ -50,7 +49,6 @@ from lusee_bayes.core.engine import in_threads, once
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge.split import log_det_of
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.normal_matrix import is_within_times, summed
 from lusee_bayes.linear.posterior import Posterior
@@ -75,7 +73,7 @@ Weights = Float[np.ndarray, "blocks places *places"]
 Roots = Float[np.ndarray, "blocks used *used"]
 Rows = Float[np.ndarray, "rows rank"]
 SkyRows = Float[np.ndarray, "rows sky"]
-Answer = tuple[float, float, float]
+Answer = tuple[float, float]
 
 
 class Missed(NamedTuple):
@@ -90,24 +88,16 @@ class Missed(NamedTuple):
         little next to the group, so that it is lost in rounding.
     directions : float
         Number of data minus the mean of chi^2_s, for noise alone.
-    log_det : float
-        ln|K_ss|, with K_ss in 1/K^2: large if the others predict the group well.
     """
 
     n: int
     chi2: float
     directions: float
-    log_det: float
 
     @property
     def degrees(self) -> float:
         """The mean of chi^2_s for noise alone."""
         return self.n - float(np.clip(self.directions, 0.0, self.n))
-
-    @property
-    def log_density(self) -> float:
-        """ln p(d_s | all others), data in K."""
-        return 0.5 * (self.log_det - self.chi2 - self.n * float(np.log(2.0 * np.pi)))
 
 
 KINDS = ("product", "day", "turntable angle")
@@ -289,15 +279,14 @@ class LeftOut:
         cells = self._on_cells(group & self.present)
         n = int(np.count_nonzero(cells))
         if n == np.count_nonzero(self.present):
-            return Missed(n, np.nan, np.nan, np.nan)
+            return Missed(n, np.nan, np.nan)
         blocks, places = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
         where = np.ix_(blocks, places)
         root = roots(self._weights[blocks], cells[blocks])
         b = solve_roots(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
         # all NaN if Q_s, or 1 - W W^T, has no root
-        chi2, directions, log_det = self._small(chosen, stretch) or self._taken_out(chosen)
-        return Missed(n, chi2, directions, log_det + 2.0 * float(np.log(diagonal_of(root)).sum()))
+        return Missed(n, *(self._small(chosen, stretch) or self._taken_out(chosen)))
 
     def each(self, groups: Sequence[GridFlags]) -> list[Missed]:
         """Leave out each of several groups, in threads; those of one stretch share its rows."""
@@ -474,7 +463,7 @@ class LeftOut:
     # --- groups in the space of their data ----------------------------------------------------
 
     def _small(self, chosen: Chosen, stretch: Stretch | None) -> Answer | None:
-        """chi^2_s, directions and ln|1 - W W^T|; None for a large group."""
+        """chi^2_s and directions; None for a large group."""
         cells, blocks, places, some, root, b = chosen
         rank = max(len(self._lower), QUICK)
         if self._kept is not None:
@@ -509,7 +498,7 @@ class LeftOut:
         solved = linalg.solve_lower(lower, np.column_stack([inside, with_sky]), transpose=False)
         chi2, directions = (float((x**2).sum()) for x in (solved[:, 0], solved[:, 1:]))
         outside = float((chosen.b**2).sum() - (inside**2).sum())
-        return outside + chi2, directions, log_det_of(lower)
+        return outside + chi2, directions
 
     # --- groups that are removed from Q -------------------------------------------------------
 
@@ -529,7 +518,7 @@ class LeftOut:
         return float(np.einsum("ij,ij->", inverse, inverse))
 
     def _taken_out(self, chosen: Chosen) -> Answer:
-        """chi^2_s, directions and ln|Q_s| - ln|Q|."""
+        """chi^2_s and directions."""
         mean = np.zeros((*chosen.cells.shape, 1))
         where = np.ix_(chosen.blocks, chosen.places)
         mean[where] = solve_roots(chosen.root, chosen.b, transpose=True)
@@ -537,9 +526,8 @@ class LeftOut:
         gram = self._gram(lost_weights(self._weights, chosen.cells))
         lower = linalg.cholesky(np.subtract(self._normal, gram, out=gram), overwrite=True)
         h = linalg.solve_lower(lower, h, transpose=False)
-        log_det = log_det_of(lower) - log_det_of(self._lower)
         directions = self._trace_of_sky(lower) - self._trace
-        return float((chosen.b**2).sum() + (h**2).sum()), directions, log_det
+        return float((chosen.b**2).sum() + (h**2).sum()), directions
 
 
 def pieces(n: int) -> list[Int[np.ndarray, " part"]]:

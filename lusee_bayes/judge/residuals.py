@@ -9,9 +9,6 @@ others by K_ss^-1 u_s, where K_ss is a block of K^-1, and ::
 Each direction of the sky that only the group measures uses a degree of freedom: a day that alone
 sees a part of the sky is not blamed for it. A bad group spoils the predictions for all others, too;
 the culprit is the group whose removal makes the rest fit.
-
-The density ln p(d_s | all others) of a group also depends on the width of its prediction: it
-penalises a prior that is too wide as it does one that is too narrow.
 """
 
 from __future__ import annotations
@@ -30,11 +27,11 @@ from lusee_bayes.linear.linear_gaussian import Solution
 # if the sky is inconsistent with the prior
 TOO_WIDE = (
     "The prior is wider than the sky requires: error bars are too wide where the sky is fainter "
-    "than the prior assumes. Choose a narrower prior (lusee-bayes compare-priors)."
+    "than the prior assumes. Map with a narrower prior (docs/howto/priors.md)."
 )
 TOO_NARROW = (
     "Error bars are too narrow where the sky is brighter than the prior assumes, and too wide "
-    "where it is fainter. Choose another prior (lusee-bayes compare-priors)."
+    "where it is fainter. Map with another prior (docs/howto/priors.md)."
 )
 
 
@@ -215,58 +212,3 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
     tests = tuple(map(judged, groups, left_out.each([group.data for group in groups])))
     z = layout.gather(left_out.u) / np.sqrt(layout.gather(left_out.inverse_diagonal))
     return Residuals(z, split, tests)
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Sums over groups of data, each compared with its prediction by all others.
-
-    Attributes
-    ----------
-    kind : {"product", "day"}
-    groups, n : int
-        Number of groups, and of their data.
-    chi2 : float
-        About ``n`` if the model is correct.
-    log_density : float
-        ln p of each group given all others, data in K.
-    """
-
-    kind: str
-    groups: int
-    n: int
-    chi2: float
-    log_density: float
-
-
-def held_out(solution: Solution, data: Visibilities) -> tuple[HeldOut, ...]:
-    """Predict products, and days of 24 hours from the first sample, from all others.
-
-    Parameters
-    ----------
-    solution : Solution
-        Of these data.
-    data : Visibilities
-        In K.
-
-    Returns
-    -------
-    tuple of HeldOut
-        One for each kind that has several groups; none if A would have to be formed and be too
-        large.
-
-    Raises
-    ------
-    InputError
-        If the model cannot be factorised.
-    """
-    left_out = LeftOut.of(solution.model, data, solution.posterior)
-    if left_out is None:
-        return ()
-    groups, parts = groups_of(data), []
-    for kind in ("product", "day"):
-        missed = left_out.each([group.data for group in groups if group.kind == kind])
-        if len(missed) > 1:
-            sums = zip(*((one.n, one.chi2, one.log_density) for one in missed), strict=True)
-            parts.append(HeldOut(kind, len(missed), *map(sum, sums)))
-    return tuple(parts)

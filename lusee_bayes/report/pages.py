@@ -23,7 +23,6 @@ from lusee_bayes.report.rendering import render, render_run
 from lusee_bayes.report.viewer import viewer
 from lusee_bayes.results.channel import Judged
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
-from lusee_bayes.results.prior_comparison import PriorsSummary, prior_table
 from lusee_bayes.results.summaries import MapSummary, SamplingSummary, ValidationSummary
 
 # number of days in the table, worst first
@@ -165,24 +164,12 @@ def comparison_page(runs: Sequence[FinishedRun], folder: Path) -> str:
     return render("comparison.html", folder, runs=runs, rows=rows, caveat=evidence_caveat(runs))
 
 
-def priors_page(folder: Path, name: str) -> str:
-    """The page of a comparison of priors as text. InputError as :func:`.map_page`."""
-    require_files(folder, ("priors.json", "scenario.yaml", "figures/priors.png"), "compare-priors")
-    path = folder / "priors.json"
-    comparison = read_model(path, PriorsSummary, "a comparison of priors")
-    header, rows = prior_table(comparison.priors)
-    words = [(one.name, one.prior) for one in comparison.priors]
-    shown = {"header": header, "rows": rows, "words": words, "notes": comparison.notes}
-    return render_run("priors.html", path, comparison.model_dump(), name=name, **shown)
-
-
 REPORT = "report.html"
 # by kind of run: makes the page as text, from the folder and the name of the run
 PAGES: dict[str, Callable[[Path, str], str]] = {
     "map": map_page,
     "sample": sample_page,
     "validate": sample_page,
-    "compare-priors": priors_page,
 }
 
 
@@ -202,8 +189,8 @@ def write_report(folder: str | Path) -> Path:
     kind = manifest and manifest["kind"]
     if kind not in PAGES:
         raise InputError(
-            f"'{folder}' has no results of lusee-bayes map, sample, validate or compare-priors; "
-            "give the folder of a finished run"
+            f"'{folder}' has no results of lusee-bayes map, sample or validate; give the "
+            "folder of a finished run"
         )
     path = folder / REPORT
     with replacing(path) as partial:

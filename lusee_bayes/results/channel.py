@@ -21,7 +21,7 @@ from lusee_bayes.experiment.diagnosis import Diagnosis
 from lusee_bayes.experiment.unknowns import InstrumentPosterior, PointingReport, UnknownsReport
 from lusee_bayes.judge import measures
 from lusee_bayes.judge.chi2 import HEADLINES, ChiSquare, Fit, Level
-from lusee_bayes.judge.coverage import Coverage, latitudes
+from lusee_bayes.judge.coverage import Coverage
 from lusee_bayes.judge.residuals import Group
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.sky_spectrum import Departure, RegionTemperatures
@@ -97,23 +97,6 @@ class Details:
     resolution_step: Float[np.ndarray, "ell ell_2"] = quantity("1", "steps of the resolution")
     prior_width: SkyModes = quantity("K", "prior standard deviation, or rms over m")
     patterns: Float[np.ndarray, "pattern node azimuth"] = quantity("1", "beams over their peaks")
-
-
-# multipoles at which SNR is reported
-ELLS = (5, 10, 20, 30)
-
-
-@dataclass(frozen=True)
-class SkyErrors:
-    """Errors of a map in a band of latitude.
-
-    name : of the band; rms_error_k : in K; std_over_sky : width of error bars relative to the
-    sky's brightness
-    """
-
-    name: str
-    rms_error_k: float
-    std_over_sky: float
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -335,16 +318,3 @@ class ChannelResult(ChannelData, Described):
             parts.append(f"resolution {self.resolution_deg:.1f} deg")
         parts.append(f"chi2 {self.chi2:.0f} (expected {self.chi2_expected:.0f})")
         return [*parts, f"{self.information_bits:.0f} bits"]
-
-    def errors_by_latitude(self) -> tuple[SkyErrors, ...]:
-        """Errors of the map by latitude, for a channel with a known truth."""
-        maps, errors = self.maps(), []
-        for name, inside in latitudes(self.nside).items():
-            rms = float(np.sqrt((maps["residual"][inside] ** 2).mean()))
-            relative = float(maps["std"][inside].mean() / maps["truth"][inside].mean())
-            errors.append(SkyErrors(name, rms, relative))
-        return tuple(errors)
-
-    def snr_at_some_ell(self) -> dict[int, float]:
-        """SNR_ell at 5, 10, 20 and 30 (up to the map's lmax), for a channel with a known truth."""
-        return {ell: float(self.snr[ell]) for ell in ELLS if ell < len(self.snr)}

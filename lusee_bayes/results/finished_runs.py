@@ -34,6 +34,7 @@ from lusee_bayes.experiment.data_files import Data, names_of_data
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.map_result import MapResult, spectrum_of
@@ -440,6 +441,20 @@ class FinishedRun:
         lmax = len(self.channel.prior_fraction) - 1
         return "no truth" if self.channel.truth is None else f"> {lmax}"
 
+    def log_evidence(self) -> float:
+        """ln p(d) of the first channel, with the parameters of a learned prior integrated out."""
+        learned = self.channel.log_evidence_learned
+        return self.channel.log_evidence if learned is None else learned
+
+    def against_truth(self) -> dict[str, float | None]:
+        """Error of the first channel's map in K, pixels within 68 % intervals, and largest pull."""
+        maps, error, held, largest = self.channel.maps(), None, None, None
+        if "residual" in maps:
+            error = float(np.sqrt((maps["residual"] ** 2).mean()))
+            whole_sky = self.channel.coverage[-1]
+            held, largest = whole_sky.held[LEVELS.index(0.68)], whole_sky.largest
+        return {"rms_error_k": error, "held_68": held, "largest_pull": largest}
+
     def sky_spectrum(self) -> SkySpectrum:
         """The spectrum of the sky. InputError for one channel."""
         if len(self.channels) == 1:
@@ -514,25 +529,28 @@ def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
 
 # figures of channels that are compared
 COMPARED = ("frequency_mhz", "n_data", "ell_cross", "resolution_deg", "information_bits")
-COMPARED += ("log_evidence", "chi2", "chi2_expected")
+COMPARED += ("chi2", "chi2_expected")
 
 
 def comparison_rows(runs: Sequence[FinishedRun]) -> list[dict[str, object]]:
     """One row for each run, with the figures that show which map is better.
 
-    The difference of ln evidence is None if the data differ.
+    ln p(d) has the parameters of a learned prior integrated out. Its difference is None if the data
+    differ; error, coverage and largest pull are None unless the sky is known.
     """
-    best = max(run.channel.log_evidence for run in runs)
+    best = max(run.log_evidence() for run in runs)
     comparable = evidence_caveat(runs) is None
     return [
         {
             "run": run.name,
             "level": run.channel.judged.level,
             **{key: getattr(run.channel, key) for key in COMPARED},
-            "log_evidence_less_best": run.channel.log_evidence - best if comparable else None,
+            "log_evidence": run.log_evidence(),
+            "log_evidence_less_best": run.log_evidence() - best if comparable else None,
             "instrument_p": run.channel.instrument.p,
             "prior_p": run.channel.judged.prior.p,
             "mean_std_k": float(run.channel.pixel_std.mean()),
+            **run.against_truth(),
         }
         for run in runs
     ]

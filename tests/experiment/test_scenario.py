@@ -99,7 +99,6 @@ REFUSED = [
     ("noise.gain={log_correlation_std: 0.5}", "log_correlation_std need treatment 'sampled'"),
     ("prior.band_edges=[3, 3]", "band_edges must increase"),
     ("prior={band_edges: [2, 4], tilt_std: 0.5}", "give either band_edges or"),
-    ("log_normal={amplitude: 0.1}", "give both amplitude and tilt, or neither"),
     ("sky.sources=true sources.list=[{name: Cas A}]", "set sky.sources=false"),
     ("sources.list=[{name: Cas A}, {name: Vir A}, {name: Cas A}]", "'Cas A' is listed twice"),
     ("sources.list=[{name: X, ra_deg: 10}]", "give both ra_deg and dec_deg, or none"),

@@ -70,10 +70,10 @@ def test_channels_that_stand_out_are_named():
 
 
 PRIORS = [
-    (400.0, False, ["compare-priors", "400, expected 200 +- 20", "too narrow"], "are fainter"),
-    (400.0, True, ["spectral.components"], "compare-priors"),
+    (400.0, False, ["another prior", "400, expected 200 +- 20", "too narrow"], "are fainter"),
+    (400.0, True, ["spectral.components"], "another prior"),
     (50.0, False, ["skies are fainter", "error bars are too wide"], "too narrow"),
-    (50.0, True, ["smaller spectral.residual"], "compare-priors"),
+    (50.0, True, ["smaller spectral.residual"], "another prior"),
 ]
 
 

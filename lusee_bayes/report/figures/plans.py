@@ -1,19 +1,15 @@
-"""Figures that compare forecasts, and one data set under several priors."""
+"""Figures that compare forecasts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from lusee_bayes.core.harmonics import power_spectrum
-from lusee_bayes.judge.coverage import LEVELS
-from lusee_bayes.report.figures.drawing import COLOURS, GREY, LINES, framed
+from lusee_bayes.report.figures.drawing import COLOURS, GREY, framed
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast
-from lusee_bayes.results.prior_comparison import PriorComparison
 
 # distinct without colour vision and by shape; repeated after four
 STYLES = tuple(zip(COLOURS, "os^D", strict=False))
@@ -110,73 +106,3 @@ def _title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
     if len({s.lmax for s in scenarios}) == 1:
         scope += rf", up to $\ell$ = {scenarios[0].lmax}"
     return f"Information content: {scope} (dashed: scenario as given)"
-
-
-# level of the interval whose coverage is drawn
-LEVEL = 0.68
-# the scale of differences is linear up to this value
-LINEAR = 3.0
-# marker of each kind of held-out data
-MARKERS = {"product": "s", "day": "o"}
-
-
-def priors(result: PriorComparison) -> Figure:
-    """Draw differences of ln evidence and of ln p, coverage by latitude, and spectra of errors."""
-    with_truth = result.known_sky
-    figure, panels = framed((14 if with_truth else 9.5, 4.4), 1, 3 if with_truth else 2)
-    _evidence(panels[0], result)
-    if with_truth:
-        _coverage(panels[1], result)
-    _errors(panels[-1], result)
-    figure.suptitle(f"{result.scenario.frequency_mhz:g} MHz: one data set under several priors")
-    return figure
-
-
-def _evidence(axes: Axes, result: PriorComparison) -> None:
-    """Draw how far each prior is below the best, for each measure."""
-    rows = np.arange(len(result.priors))
-    behind = np.array([result.best.log_evidence - one.log_evidence for one in result.priors])
-    colours = [COLOURS[k % len(COLOURS)] for k in rows]
-    axes.barh(rows, behind, color=colours, alpha=0.6, height=0.6, label="ln evidence (bars)")
-    for j, held in enumerate(result.best.held_out):
-        values = np.array([one.held_out[j].log_density for one in result.priors])
-        style = {"mfc": "none", "ms": 7, "label": f"ln p of held-out {held.kind}s"}
-        axes.plot(values.max() - values, rows, f"k{MARKERS[held.kind]}", **style)
-    axes.set_yticks(rows, [one.name for one in result.priors])
-    axes.invert_yaxis()
-    axes.set_xscale("symlog", linthresh=LINEAR, linscale=0.5)
-    axes.set(xlabel="difference from the best", xlim=(-0.5, None))
-    axes.legend(frameon=False, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
-
-
-def _coverage(axes: Axes, result: PriorComparison) -> None:
-    n, k = len(result.priors), LEVELS.index(LEVEL)
-    parts = [part.name for part in result.priors[0].coverage]
-    for j, one in enumerate(result.priors):
-        x = np.arange(len(parts)) + 0.6 * ((j + 0.5) / n - 0.5)
-        held = [100.0 * part.held[k] for part in one.coverage]
-        scatter = [100.0 * part.scatter[k] for part in one.coverage]
-        colour = COLOURS[j % len(COLOURS)]
-        axes.errorbar(x, held, yerr=scatter, fmt="o", color=colour, capsize=3, label=one.name)
-    axes.axhline(100.0 * LEVEL, color=GREY, lw=0.8)
-    axes.set_xticks(np.arange(len(parts)), parts, fontsize=8)
-    axes.set(ylabel=f"pixels covered by {LEVEL:.0%} intervals [%]", ylim=(None, 101.0))
-
-
-def _errors(axes: Axes, result: PriorComparison) -> None:
-    for j, (one, channel) in enumerate(zip(result.priors, result.channels, strict=True)):
-        colour, line = COLOURS[j % len(COLOURS)], LINES[j % len(LINES)]
-        error = power_spectrum(channel.std)[1:]
-        ell = np.arange(1, len(error) + 1)
-        if channel.truth is not None:
-            axes.semilogy(ell, error, color=colour, ls=":", lw=1.0)
-            error, line = power_spectrum(channel.mean - channel.truth)[1:], "-"
-        axes.semilogy(ell, error, color=colour, ls=line, lw=1.3, label=one.name)
-    if result.known_sky:
-        truth = power_spectrum(result.channels[0].truth)[1:]
-        axes.semilogy(ell, truth, color=GREY, lw=1.0, label="true sky")
-        axes.set_title("errors (dotted: expected from the error bars)", fontsize=9)
-    else:
-        axes.set_title("expected errors", fontsize=9)
-    axes.set(xlabel=r"multipole $\ell$", ylabel=r"$C_\ell$ [K$^2$]")
-    axes.legend(frameon=False, fontsize=8)
