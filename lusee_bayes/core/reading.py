@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import os
 import stat
+import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -244,6 +245,7 @@ def _yaml() -> YAML:
     plain = YAML(typ="safe", pure=True)
     plain.Constructor = _Constructor
     plain.allow_unicode = False  # Unicode line breaks would be lost
+    plain.width = sys.maxsize  # folded lines of escaped letters would gain spaces
     plain.sort_base_mapping_type_on_output = False
     return plain
 
