@@ -7,7 +7,7 @@ import re
 import pytest
 from changes import SCALE, require_answer
 from commands import refused
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lusee_bayes.cli.main import main
@@ -209,6 +209,7 @@ def test_every_entry_with_any_value(n):
 def test_any_text_as_an_override(n):
     @settings(max_examples=n)
     @given(st.one_of(st.text(), st.builds("{}={}".format, st.sampled_from(PATHS), st.text())))
+    @example("prior.mean_file=" + 100 * "\u0331" + " x")  # longer than a line, in escaped letters
     def check(override):
         require_answer(lambda: load([override]))
         require_answer(lambda: given_variations("fiducial", [override], []))
