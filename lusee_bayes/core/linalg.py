@@ -20,7 +20,7 @@ from math import ceil, log2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.linalg import cython_blas, cython_lapack
 
 from lusee_bayes.core.arrays import Array, namespace
@@ -71,6 +71,9 @@ INVERTED = 256
 
 # rows of a lower triangle to mirror at once
 MIRRORED = 128
+
+# rows to permute at once
+PERMUTED = 64
 
 # error of combinations of a few rows of a matrix, relative to its largest row
 SPANNED = 1e-12
@@ -322,6 +325,17 @@ def mirrored(lower: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
         block = lower[first:end, first:end]
         block[:] = np.tril(block) + np.tril(block, -1).T
     return lower
+
+
+def permuted(
+    matrix: Float[np.ndarray, "n m"], rows: Int[np.ndarray, " n"], columns: Int[np.ndarray, " m"]
+) -> Float[np.ndarray, "n m"]:
+    """Return M_rows,columns, in blocks that fit the cache."""
+    result = np.empty_like(matrix)
+    for first in range(0, len(rows), PERMUTED):
+        block = slice(first, first + PERMUTED)
+        result[block] = matrix[rows[block]].take(columns, axis=1)
+    return result
 
 
 def _reversed(matrix: Matrix) -> Matrix:

@@ -167,31 +167,26 @@ class SphereGrid(eqx.Module):
         lmax = highest if lmax is None else lmax
         square = lmax == highest
         fourier = np.fft.fft(np.asarray(field) * np.asarray(self.weights)[:, None], axis=1).T
-        transposed = np.ascontiguousarray(table[: lmax + 1, :, : lmax + 1].transpose(0, 2, 1))
+        order, ell = np.triu_indices(lmax + 1)
+        legendre = table[order, :, ell]
         # rows and columns ordered by |m|
         rows, columns = (harmonics.modes_by_size_of_order(x) for x in (lmax, highest))
-        ell, order = (x[rows] for x in harmonics.mode_numbers(lmax))
-        starts = np.searchsorted(
-            np.abs(harmonics.mode_numbers(highest)[1][columns]), range(highest + 1)
-        )
+        row, column = np.argsort(rows), np.argsort(columns)
         matrix = np.empty((len(rows), len(columns)))
         for m in range(highest + 1):
-            others = np.arange(m if square else 0, lmax + 1)
+            others = np.arange(lmax + 1)
             low, high = fourier[others - m], fourier[(others + m) % self.n_phi]
             # cos m'phi and sin m'phi, times cos m phi and sin m phi
             cosine = (low + high).real, (low + high).imag
             sine = (high - low).imag, (low - high).real
-            for part, factors in enumerate([cosine, sine][: 1 + (m > 0)]):
-                first = starts[m] + part * (highest + 1 - m)
-                for negative, factor in enumerate(factors):
-                    blocks = transposed[others] @ (table[m][:, m:] * (0.5 * factor)[:, :, None])
-                    to = np.flatnonzero(((order < 0) == negative) & (np.abs(order) >= others[0]))
-                    values = blocks[np.abs(order[to]) - others[0], ell[to]]
-                    matrix[to, first : first + highest + 1 - m] = values
-        if square:
-            matrix = linalg.mirrored(matrix)
-        rows, columns = np.argsort(rows), np.argsort(columns)
-        return matrix[rows].take(columns, axis=1)
+            for sign, factors in zip((1, -1), [cosine, sine][: 1 + (m > 0)], strict=False):
+                first = column[m * (m + 1) + sign * m]
+                for other, factor in zip((1, -1), factors, strict=True):
+                    some = slice(np.searchsorted(order, max(m if square else 0, other < 0)), None)
+                    n, to = order[some], ell[some] * (ell[some] + 1) + other * order[some]
+                    values = (legendre[some] * (0.5 * factor)[n]) @ table[m][:, m:]
+                    matrix[row[to], first : first + highest + 1 - m] = values
+        return linalg.permuted(linalg.mirrored(matrix) if square else matrix, row, column)
 
     def diagonal(self, matrix: Float[np.ndarray, "modes modes"]) -> Float[np.ndarray, "rings phi"]:
         """Compute y^T C y at the grid's points: the variance of a field with covariance C.
