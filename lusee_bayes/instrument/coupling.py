@@ -22,7 +22,7 @@ so the dA of a difference of beams is the A of that difference.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import equinox as eqx
@@ -506,13 +506,13 @@ class CouplingMatrix(Coupling):
         zero_order = np.arange(self.lmax + 1)[None] == 0
         crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
         both = xp.stack([pairs.T, crossed.T], axis=-1)
-        cosine, sine = _phases(self.pointing.azimuth, self.lmax)
         grids = []
-        for run, span in self.pointing.runs():
+        for run, part in self._parts():
             x_and_y = self.by_order[run] @ both
-            over_time = cosine[span] @ x_and_y[..., 0] + sine[span] @ x_and_y[..., 1]
+            cosine, sine = _phases(self.pointing.azimuth[part], self.lmax)
+            over_time = cosine @ x_and_y[..., 0] + sine @ x_and_y[..., 1]
             over_time = over_time.reshape(-1, n_products, n_functions)
-            grids.append((over_time * self.pointing.functions[span][:, None]).sum(-1).T)
+            grids.append((over_time * self.pointing.functions[part][:, None]).sum(-1).T)
         return self.layout.gather(xp.concatenate(grids, axis=1))
 
     @compiled
@@ -520,20 +520,18 @@ class CouplingMatrix(Coupling):
         """The transpose of :func:`_forward`, step by step."""
         n, columns = self.lmax + 1, data.shape[1:]
         grid = self.layout.scatter(data.reshape(len(data), -1))
-        phases, functions = _phases(self.pointing.azimuth, self.lmax), self.pointing.functions
+        functions = self.pointing.functions
         n_products, n_functions = self.body_beams.shape[1:3]
         xp, both = namespace(grid, functions), 0.0
-        for run, span in self.pointing.runs():
-            for first in range(span.start, span.stop, MOST_TIMES):
-                part = slice(first, min(first + MOST_TIMES, span.stop))
-                over_time = grid[:, part].swapaxes(0, 1).reshape(part.stop - first, -1)
-                waves = []
-                for wave in phases:
-                    wave = wave[part][:, :, None] * functions[part][:, None]
-                    seen = wave.reshape(len(over_time), -1).T @ over_time
-                    seen = seen.reshape(n, n_functions, n_products, -1).swapaxes(1, 2)
-                    waves.append(seen.reshape(n, n_products * n_functions, -1))
-                both = both + self.by_order[run].swapaxes(1, 2) @ xp.concatenate(waves, axis=-1)
+        for run, part in self._parts():
+            over_time = grid[:, part].swapaxes(0, 1).reshape(part.stop - part.start, -1)
+            waves = []
+            for wave in _phases(self.pointing.azimuth[part], self.lmax):
+                wave = wave[:, :, None] * functions[part][:, None]
+                seen = wave.reshape(len(over_time), -1).T @ over_time
+                seen = seen.reshape(n, n_functions, n_products, -1).swapaxes(1, 2)
+                waves.append(seen.reshape(n, n_products * n_functions, -1))
+            both = both + self.by_order[run].swapaxes(1, 2) @ xp.concatenate(waves, axis=-1)
         # (orders, degrees, columns): for the pairs, and for the crossed pairs
         half = both.shape[-1] // 2
         straight, crossed = both[..., :half], both[..., half:]
@@ -541,6 +539,12 @@ class CouplingMatrix(Coupling):
         ell, m = mode_numbers(self.lmax)
         packed = xp.where((m >= 0)[:, None], plus[np.abs(m), ell], minus[np.abs(m), ell])
         return self.pointing.pole_from_galactic.T(packed.T).T.reshape(-1, *columns)
+
+    def _parts(self) -> Iterator[tuple[int, slice]]:
+        """Runs in parts of at most MOST_TIMES samples: number of the run, and its samples."""
+        for run, span in self.pointing.runs():
+            for first in range(span.start, span.stop, MOST_TIMES):
+                yield run, slice(first, min(first + MOST_TIMES, span.stop))
 
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""
