@@ -7,11 +7,13 @@ module also provides priors by name, to compare how probable the data are under 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lusee_bayes.core.arrays import DataVector, Grid, Modes, Vector
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
@@ -41,8 +43,8 @@ FARTHEST = 2.0
 # in the first rounds, while chi^2 at the expansion point exceeds TEMPERED per datum, radiometer
 # noise is assumed larger to match
 TEMPERED, MAX_TEMPERED_ROUNDS = 10.0, 20
-# factor that widens the prior to allow any sky
-WIDE = 1e2
+# factors that widen the prior to allow any sky: the first under which rounding permits a solution
+WIDE = 1e2, 1e1
 # if, even then, chi^2 is too large by FAR_OFF of its standard deviations, up to OTHER_WAYS other
 # starting points are tried
 FAR_OFF, OTHER_WAYS = 10.0, 6
@@ -160,8 +162,15 @@ class Inference:
         n, solution = len(self.solution.data), self.solution
         most = n + FAR_OFF * (2.0 * n) ** 0.5
         if solution.chi2 >= most:
-            solution = self.under(self.model.prior.widened(WIDE)).solution
+            solution = self.under_any_sky()
         return solution.chi2 < most
+
+    def under_any_sky(self) -> Solution:
+        """The solution under a prior that allows any sky, as wide as rounding permits."""
+        for factor in WIDE:
+            with suppress(InputError):
+                return self.under(self.model.prior.widened(factor)).solution
+        return self.solution
 
     def moves_from(self, mean: Modes) -> float:
         """Distance of the map from ``mean``, or from the sky at the expansion point if larger.

@@ -31,7 +31,7 @@ from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, moved, systematics
-from lusee_bayes.experiment.rounds import WIDE, Inference
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.unknowns import tested_offsets
 from lusee_bayes.linear.amplitudes import AmplitudesOfSky
 from lusee_bayes.noise.covariance import LowRankFactor
@@ -211,7 +211,7 @@ def blind_spots(
     moved_setup = moved(setup, inference.around.values)
     solution, model = inference.solution, base_model(moved_setup, inference.around)
     root = solution.posterior.root()
-    wide = solution.under(inference.model.prior.widened(WIDE)).posterior.root()
+    wide = inference.under_any_sky().posterior.root()
     spots, degrees = [], max(inference.model.n_data - len(sky), 1)
     for systematic, sizes, unit in errors_of(moved_setup, pointing=pointing):
         if has.issuperset(sizes):

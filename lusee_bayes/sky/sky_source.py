@@ -347,7 +347,7 @@ class SkyAlms(SkyFile):
         if lmax > self.lmax:
             raise InputError(
                 f"{self.path} has coefficients up to ell = {self.lmax}, expected up to {lmax}; "
-                "lower lmax"
+                "lower lmax, or noise.above_lmax.least_lmax"
             )
         mhz, channel = self.frequencies_mhz, 0
         if mhz is not None:

@@ -17,6 +17,7 @@ from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.report.pages import map_page
 from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.regolith import ground_per_kelvin
+from lusee_bayes.testing import small_scenario
 
 RECEIVER, GROUND = "noise.receiver={power_k: 2000}", "noise.regolith={std_k: 30}"
 TABLE = "noise.gain_table={std: 0.01}"
@@ -176,3 +177,17 @@ def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(respons
     wrong = replace(wrong, background=first.background)
     off = np.asarray(lb.infer(Experiment(wrong, data)).posterior.mean) - np.asarray(unknown.mean)
     assert np.abs(off / np.asarray(unknown.std()))[1:].max() > 1.0
+
+
+@pytest.mark.parametrize(("lost", "width"), [(0.0, 1e2), (1e-3, 1e1), (1e-1, 1.0)])
+def test_the_prior_that_allows_any_sky_is_as_wide_as_rounding_permits(lost, width):
+    """Rounding may leave A^T N^-1 A with negative eigenvalues: -``lost`` in the prior's units."""
+    found = lb.infer(lb.build(small_scenario(lmax=3, cycles=0.1)))
+    information, widths = found.solution.information, np.sqrt(found.model.prior.variance())
+    values, vectors = np.linalg.eigh(information.matrix * np.outer(widths, widths))
+    direction = vectors[:, 0] / widths
+    less = np.outer(direction, direction) * ((values[0] + lost) * (lost > 0.0))
+    kept = replace(information, matrix=information.matrix - less)
+    found = replace(found, solution=replace(found.solution, kept_information=kept))
+    wide = found.under_any_sky().model.prior
+    np.testing.assert_allclose(wide.variance(), (width * widths) ** 2, rtol=1e-12)
