@@ -138,6 +138,9 @@ HIGHER = np.array([1.0, 1e2, 1e4])
 INFINITE = "the mean of a variance over the prior's uncertain parameters is infinite"
 # shifts of ln C at which the evidence of the averaged prior is computed, to find the best one
 LEVELS = (-1.0, -0.5, 0.0)
+# a level whose standard deviation exceeds MEASURED is only limited by the data, and FIXED: the mean
+# of its exponential would be far above that limit
+MEASURED, FIXED = 1.0, 1e-3
 # how often a fixed prior is widened tenfold if rounding prevents a posterior mean
 MOST_WIDENINGS = 4
 
@@ -374,11 +377,15 @@ def _learned(
 ) -> Learned:
     covariance = np.linalg.inv(point.curvature(family, rng, FINAL_SIMULATIONS))
     scores = normal_scores(family.hyperprior, point.parameters, covariance)
-    mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
     evidence = float(point.posterior.log_evidence) + scores.log_gain
+    first = np.arange(len(covariance)) == 0
+    mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
+    if about[0, 0] > MEASURED**2:
+        others = np.where(np.logical_or.outer(first, first), 0.0, scores.covariance)
+        scores = replace(scores, covariance=others + FIXED**2 * np.diag(first))
+        mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
 
     # S is a constant plus a part proportional to the level
-    first = np.arange(len(mean)) == 0
     with np.errstate(over="raise"), refusing(INFINITE, FloatingPointError):
         once, twice = (family.averaged(mean + level * first, about) for level in (0.0, np.log(2.0)))
 
@@ -389,6 +396,7 @@ def _learned(
     tried = [float(at_level(shift).log_evidence) for shift in LEVELS]
     square, linear, _ = np.polyfit(LEVELS, tried, 2)
     shift = -0.5 * linear / square if square < 0 else LEVELS[int(np.argmax(tried))]
+    shift = float(np.clip(shift, LEVELS[0] - 1.0, LEVELS[-1] + 1.0))
     moved = shift * first / family.hyperprior.slopes_of_scores(scores.mean)[0]
     prior, scores = at_level(shift).prior, replace(scores, mean=scores.mean + moved)
     return Learned(prior, point.parameters, covariance, scores, evidence)

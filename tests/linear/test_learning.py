@@ -100,6 +100,19 @@ def test_learning_gains_over_the_start_under_local_scales():
     assert [row["name"] for row in found.as_rows()] == list(family.names)
 
 
+def test_a_sky_without_texture_has_none():
+    """Data that only limit the texture's level: the best is where it no longer matters."""
+    family = embedded_local_scales(25.0, LMAX)
+    information = information_of(1.02 * family.mean)
+    found = learning.learn_whatever_fits(family, information)
+    assert found.settled and found.noise_factor == 1.0
+    mean, about = family.hyperprior.moments(found.scores.mean, found.scores.covariance)
+    mean[0] = -300.0
+    none = family.prior(family.averaged(mean, about))
+    best, expected = (float(information.posterior(p).log_evidence) for p in (found.prior, none))
+    assert best > expected - 0.1
+
+
 def test_variances_beyond_the_data_are_means_over_parameters(case):
     scores = learning.learn(case.family, case.information).scores
     wider, rng, n = IsotropicFamily.around(2e4, 3 * LMAX), np.random.default_rng(3), 40_000
