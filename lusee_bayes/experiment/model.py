@@ -93,10 +93,10 @@ def set_up(
         pieces = observation, sky, source, source, beams, coupling, prior, responses, background
         calibration = None if data is None else data.calibration
         of_data = {"receiver": receiver, "calibration": calibration, "measured": data is not None}
-        setup = Setup(scenario, *pieces, **of_data, family=family).with_signal()
+        setup = Setup(scenario, *pieces, **of_data, family=family)
     horizon = scenario.noise.horizon
     setup = setup if horizon is None else Horizon.moved(horizon, setup, {})
-    return with_sky_above(setup)
+    return with_sky_above(setup.with_signal())
 
 
 def with_sky_above(setup: Setup, covariance: ModesMatrix | None = None) -> Setup:
@@ -162,9 +162,11 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
 
 def moved(setup: Setup, values: Truth | None) -> Setup:
     """The setup with these values of the instrument, and its signal for them."""
-    for cls, section in present(setup.scenario) if values else ():
+    if not values:
+        return setup
+    for cls, section in present(setup.scenario):
         setup = cls.moved(section, setup, values)
-    return setup
+    return setup.with_signal()
 
 
 def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, Systematic]]:

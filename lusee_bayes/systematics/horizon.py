@@ -197,13 +197,12 @@ class Horizon(ChangedBeams):
         terrain = cls.build(section, replace(setup, observation=observation), Around())
         hidden = np.asarray(terrain.hidden({name: values.get(name, 0.0) for name in terrain.names}))
         emitted = (terrain.before - hidden)[..., 0] * terrain.uniform[0]
-        made = replace(
+        return replace(
             setup,
             coupling=setup.coupling.of(modes=np.asarray(setup.beams.modes) + hidden),
             background=setup.background + emitted[observation.run].T,
             hidden=hidden if setup.hidden is None else setup.hidden,
         )
-        return made.with_signal()
 
     @property
     def uniform(self) -> Modes:

@@ -306,7 +306,7 @@ class MovingSources(eqx.Module):
 
 
 def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
-    """The setup with another observation, and its A, responses to sources and signal."""
+    """The setup with another observation, its A and its responses to sources."""
     given = ", ".join(f"{name} = {value:g}" for name, value in values.items() if value)
     with naming(f"noise.pointing, with {given or 'no offsets'}"):
         observation = with_offsets(setup.observation, values)
@@ -321,4 +321,4 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
         observation=observation,
         coupling=setup.coupling.of(pointing=pointing),
         responses=source_responses(*inputs),
-    ).with_signal()
+    )

@@ -252,7 +252,7 @@ class Systematic(eqx.Module):
 
     @classmethod
     def moved(cls, section: Any, setup: Setup, values: Values) -> Setup:
-        """The setup with an instrument that has these values; by default unchanged."""
+        """The setup with these values of the instrument and the old signal; by default the same."""
         return setup
 
     @classmethod

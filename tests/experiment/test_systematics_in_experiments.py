@@ -11,7 +11,7 @@ from experiments import small_experiment
 import lusee_bayes as lb
 from lusee_bayes.experiment import model as models
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import full_model, radiometer
+from lusee_bayes.experiment.model import full_model, radiometer, true_values
 from lusee_bayes.experiment.rounds import SETTLED, Inference, prediction
 from lusee_bayes.noise.covariance import LowRankUpdate
 from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams
@@ -51,6 +51,38 @@ def test_the_posteriors_own_prediction_has_settled():
     # it did move on the way
     measured = inferred(GAIN, "noise.gain.visibilities=measured").posterior
     assert float(posterior.rms_shift_from(measured.mean)) > SETTLED
+
+
+MOVES = {
+    "beam": "noise.beam={parameters: {deep_permittivity: 0.3, zenith_angle_deg: 0.3}}",
+    "fields": "noise.fields={}",
+    "pointing": "noise.pointing={turntable_deg: 0.5, clock_s: 60}",
+    "horizon": "noise.horizon={std_deg: 2, altitude_deg: 3}",
+}
+
+
+@pytest.mark.parametrize("name", MOVES)
+def test_the_signal_of_an_instrument_with_other_values_is_its_own(name):
+    """A m + background of the moved instrument, with A as rows; and it differs from the first."""
+    setup = small_experiment(MOVES[name], lmax=4, cycles=0.05).setup
+    there = models.moved(setup, true_values(setup))
+    seen = there.coupling.dense() @ there.sky.modes + there.layout.gather(there.background)
+    got = np.asarray(there.layout.gather(there.signal))
+    within(got, seen, 1e-12 * np.abs(seen).max())
+    assert np.abs(got - setup.layout.gather(setup.signal)).max() > 1e-4 * np.abs(seen).max()
+
+
+@pytest.mark.essential
+def test_gains_are_about_what_antennas_with_found_values_would_see():
+    """Their visibilities, times found gains, leave only the noise: 1e-5 of them; with those of the
+    expected antennas it is 1e-2."""
+    overrides = "noise.gain.sigma=0.005", MOVES["beam"], "prior={model: local_scales}"
+    found = inferred(*overrides, "lmax=6")
+    (drifts,), data = found.drifts, found.solution.data
+    seen = drifts.response(drifts.found) * drifts.layout.gather(drifts.visibilities)
+    std = np.sqrt(np.asarray(radiometer(experiment(*overrides, "lmax=6").setup).diagonal()))
+    chi2 = float((((data - np.asarray(seen)) / std) ** 2).sum())
+    assert 0.5 < chi2 / len(data) < 1.5
 
 
 # --- beams ------------------------------------------------------------------------------------
