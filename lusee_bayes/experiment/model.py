@@ -162,11 +162,10 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
 
 def moved(setup: Setup, values: Truth | None) -> Setup:
     """The setup with these values of the instrument, and its signal for them."""
-    if not values:
-        return setup
-    for cls, section in present(setup.scenario):
-        setup = cls.moved(section, setup, values)
-    return setup.with_signal()
+    made = setup
+    for cls, section in present(setup.scenario) if values else ():
+        made = cls.moved(section, made, values)
+    return setup if made is setup else made.with_signal()
 
 
 def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, Systematic]]:
