@@ -138,8 +138,8 @@ HIGHER = np.array([1.0, 1e2, 1e4])
 INFINITE = "the mean of a variance over the prior's uncertain parameters is infinite"
 # shifts of ln C at which the evidence of the averaged prior is computed, to find the best one
 LEVELS = (-1.0, -0.5, 0.0)
-# a level whose standard deviation exceeds MEASURED is only limited by the data, and FIXED: the mean
-# of its exponential would be far above that limit
+# a level whose standard deviation, given the other parameters, exceeds MEASURED is only limited by
+# the data, and FIXED: the mean of its exponential would be far above that limit
 MEASURED, FIXED = 1.0, 1e-3
 # how often a fixed prior is widened tenfold if rounding prevents a posterior mean
 MOST_WIDENINGS = 4
@@ -380,7 +380,7 @@ def _learned(
     evidence = float(point.posterior.log_evidence) + scores.log_gain
     first = np.arange(len(covariance)) == 0
     mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
-    if about[0, 0] > MEASURED**2:
+    if np.linalg.inv(about)[0, 0] < MEASURED**-2:
         others = np.where(np.logical_or.outer(first, first), 0.0, scores.covariance)
         scores = replace(scores, covariance=others + FIXED**2 * np.diag(first))
         mean, about = family.hyperprior.moments(scores.mean, scores.covariance)

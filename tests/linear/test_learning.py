@@ -19,10 +19,11 @@ from lusee_bayes.priors.local_scales import embedded_local_scales
 LMAX, N_DATA = 6, 120
 
 
-def information_of(sky, noise=30.0, seed=2, n_data=N_DATA, strength=1.0) -> Information:
-    """Of data of a sky through a random A."""
+def information_of(sky, noise=30.0, seed=2, n_data=N_DATA, strength=1.0, seen=None) -> Information:
+    """Of data of a sky, or of its first modes, through a random A."""
     rng = np.random.default_rng(seed)
     coupling = strength * rng.standard_normal((n_data, len(sky))) / np.sqrt(len(sky))
+    coupling[:, len(sky) if seen is None else seen :] = 0.0
     data = coupling @ sky + noise * rng.standard_normal(n_data)
     prior = lb.HarmonicPrior(np.full(round(np.sqrt(len(sky))), 1e8))
     variance = lb.DiagonalCovariance(np.full(n_data, noise**2))
@@ -362,3 +363,23 @@ def test_parameters_without_a_covariance_are_drawn_anew_and_then_refused():
     given = hopeless, *weakly_known(plain, 1.0), jax.random.key(1), 3
     words = "cannot draw skies with uncertain prior parameters"
     refuse(words, learning.draws_with_parameters, *given)
+
+
+def test_a_level_that_only_the_tilt_makes_uncertain_is_learned():
+    """Data up to ell = 3 and any tilt: the level, at ell = 9, is uncertain by more than a factor e.
+
+    What is measured keeps its size, and what is not gets the mean variance of the possible tilts.
+    """
+    family, seen = IsotropicFamily.around(2e4, 12), 16
+    width = np.full(family.hyperprior.size, 1e-3)
+    width[:2] = family.hyperprior.width[0], 2.0
+    family = replace(family, hyperprior=replace(family.hyperprior, width=width))
+    expected = family.at(family.hyperprior.start()).covariance.diagonal()
+    sky = np.sqrt(expected) * np.random.default_rng(3).choice([-1.0, 1.0], len(expected))
+    found = learning.learn(family, information_of(sky, seen=seen))
+    assert found.covariance[0, 0] > 1.0
+    learned = found.prior.covariance().diagonal()
+    # one of sqrt(2 / 15): of the squares of 15 modes
+    assert np.abs(np.log(learned[1:seen] / expected[1:seen])).max() < 1.0
+    chosen = family.at(found.parameters).covariance.diagonal()
+    assert (learned[100:] > 1.3 * chosen[100:]).all()
