@@ -2,11 +2,11 @@
 
 ::
 
-    m = T + s_T x_1 T + s_0 x_0 Y_00 + sum_i x_i (T_i - T) + sum_k s_k x_k o(k)
+    m = T + s_T x_1 T + s_0 x_0 Y_00 + sum_q x_q (T_q - T) + sum_k s_k x_k o(k)
           + f sum_b x_b y(b) + sum_i g_i x_i D(i) + R sum_j w_j P [sqrt(v_j) n_j]
 
 T is a template; its scale and the monopole have wide priors. With surveys of the sky, T is their
-mean, and T_i are the surveys and the embedded template. o(k) are named extended objects, y(b) the
+mean, and T_q are the surveys and the embedded template. o(k) are named extended objects, y(b) the
 point sources of the catalogue and, without surveys, D(i) broad discs all over the sky. n_j is
 white noise on the sphere, v_j(p) a positive field, P the harmonic analysis, w_j windows in ell an
 octave wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2). If all v_j = 1, the last term is an
