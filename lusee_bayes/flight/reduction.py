@@ -2,7 +2,7 @@
 
 Counts are read in slabs. All spectra of a few bins of time form a piece. They are calibrated and
 put into bands, each spectrum as a separate bin, and bursts are flagged; then they are averaged into
-the final bins. No more spectra than that are ever in memory.
+the final bins. In memory are the bands of one piece, and two slabs, the second being read ahead.
 """
 
 from __future__ import annotations
