@@ -5,7 +5,6 @@ from .experiment.experiment import build as build
 from .experiment.experiment import infer as infer
 from .experiment.scenario import load_scenario as load_scenario
 from .instrument.beams.monopoles import monopole_beams as monopole_beams
-from .instrument.beams.sampled import sampled_beams as sampled_beams
 from .instrument.coupling import CouplingMatrix as CouplingMatrix
 from .instrument.observation import Observation as Observation
 from .instrument.schedule import Run as Run
@@ -30,14 +29,11 @@ from .runs.sample_run import run_validate as run_validate
 from .sampling.distributions import CorrelatedNormal as CorrelatedNormal
 from .sampling.distributions import Marginal as Marginal
 from .sampling.distributions import SkyPrior as SkyPrior
-from .sampling.distributions import TimesStudentT as TimesStudentT
 from .sampling.hmc import Sampler as Sampler
 from .sampling.hmc import Whitening as Whitening
 from .sampling.hmc import sample as sample
-from .sampling.mode import estimate_evidence as estimate_evidence
 from .sampling.programs import load_program as load_program
 from .sky.prior import HarmonicPrior as HarmonicPrior
 from .sky.sky_source import Sky as Sky
 from .sky.sky_source import galaxy_sky as galaxy_sky
 from .sky.sky_source import sky_from_file as sky_from_file
-from .systematics.systematic import sky_is_sampled as sky_is_sampled

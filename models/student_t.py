@@ -8,6 +8,7 @@ fit, 1e-3 where they deviate by 30 sigma.
 import numpyro
 
 import lusee_bayes as lb
+from lusee_bayes.sampling.distributions import TimesStudentT
 
 # nu is fixed: a few strong bursts would pull it down to about 2, and make the weights of good times
 # nearly random
@@ -19,6 +20,6 @@ def model(gaussian, systematics, layout, data=None):
     for systematic in systematics:
         gaussian = systematic.sampled(gaussian)
     sky = numpyro.sample("sky", lb.SkyPrior(gaussian.prior))
-    seen = lb.TimesStudentT(gaussian.predict(sky), gaussian.noise, layout, FREEDOM)
+    seen = TimesStudentT(gaussian.predict(sky), gaussian.noise, layout, FREEDOM)
     data = numpyro.sample("data", seen, obs=data)
     numpyro.deterministic("weight", seen.weights(data))

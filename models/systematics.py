@@ -7,13 +7,14 @@ numerous (gain drifts, errors of fields), it is more efficient to sample the sky
 import numpyro
 
 import lusee_bayes as lb
+from lusee_bayes.systematics.systematic import sky_is_sampled
 
 
 def model(gaussian, systematics, data=None):
     """``gaussian``: the model without ``systematics``, which are applied one after another."""
     for systematic in systematics:
         gaussian = systematic.sampled(gaussian)
-    if lb.sky_is_sampled(systematics):
+    if sky_is_sampled(systematics):
         sky = numpyro.sample("sky", lb.SkyPrior(gaussian.prior))
         seen = lb.CorrelatedNormal(gaussian.predict(sky), gaussian.noise)
         numpyro.sample("data", seen, obs=data)

@@ -310,7 +310,7 @@ class SampledBeamSection(_FileSection):
     Attributes
     ----------
     file : str
-        netCDF or FITS from ``lusee_bayes.sampled_beams``, or a pyuvdata beam FITS.
+        netCDF or FITS from ``write_sampled_beams``, or a pyuvdata beam FITS.
     normalise : bool
         Scale the beams so that autos integrate to one on average; default: as in the file.
     """

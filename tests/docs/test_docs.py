@@ -26,6 +26,7 @@ from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.scenario import scenario_names
+from lusee_bayes.sampling.mode import estimate_evidence
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -283,7 +284,7 @@ def test_both_faces_of_the_guides_systematic_have_one_evidence():
     cable = made["CablePickup"](jnp.asarray(rng.normal(size=30)), 0.7)
     data = gaussian.sample(jax.random.key(0))[1] + 0.5 * cable.pattern
     program = lb.load_program("systematics")
-    found = lb.estimate_evidence(program, {"gaussian": gaussian, "systematics": (cable,)}, data)
+    found = estimate_evidence(program, {"gaussian": gaussian, "systematics": (cable,)}, data)
     exact = float(cable.marginalised(gaussian).log_prob(data))
     # a Gaussian is what the proposal is about, so that nearly every draw counts
     assert found.effective > 200

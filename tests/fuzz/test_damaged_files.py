@@ -19,7 +19,7 @@ from lusee_bayes.experiment.data_files import reduce_files
 from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
-from lusee_bayes.instrument.beams.sampled import read_beam, write_sampled_beams
+from lusee_bayes.instrument.beams.sampled import read_beam, sampled_beams, write_sampled_beams
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
@@ -91,10 +91,10 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
     theta, phi = np.linspace(0.0, 90.0, 7), np.arange(0.0, 360.0, 45.0)
     fields = np.ones((4, 7, 8), dtype=complex)
-    sampled = lb.sampled_beams(25.0, e_theta=fields, e_phi=fields, theta_deg=theta, phi_deg=phi)
+    sampled = sampled_beams(25.0, e_theta=fields, e_phi=fields, theta_deg=theta, phi_deg=phi)
     write_sampled_beams(folder / "sampled_fields.nc", sampled)
     write_sampled_beams(folder / "sampled_fields.fits", sampled)
-    products = lb.sampled_beams([20.0, 30.0], products=np.ones((2, 4, 48)))
+    products = sampled_beams([20.0, 30.0], products=np.ones((2, 4, 48)))
     write_sampled_beams(folder / "sampled_products.nc", products)
     with pytest.MonkeyPatch.context() as patch:
         # neither figures nor a page, which take longer than the map

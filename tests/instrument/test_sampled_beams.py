@@ -15,7 +15,12 @@ from reference import tangents, unit_vectors, vectors
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings
 from lusee_bayes.instrument.beams.monopoles import Monopoles, wavenumber
-from lusee_bayes.instrument.beams.sampled import from_uvbeam, read_beam, write_sampled_beams
+from lusee_bayes.instrument.beams.sampled import (
+    from_uvbeam,
+    read_beam,
+    sampled_beams,
+    write_sampled_beams,
+)
 from lusee_bayes.instrument.products import labels, to_real
 from lusee_bayes.report.describe import describe
 from lusee_bayes.testing import check_beam_source, small_scenario
@@ -84,7 +89,7 @@ def test_short_dipoles_have_their_closed_form(kind):
             phase = np.exp(1j * k * np.tensordot(places, n, 1))
             return tuple(np.tensordot(arms, axis, 1) * phase for axis in along)
 
-    made = lb.sampled_beams(FREQUENCY, **KINDS[kind](Dipoles()), absolute=True)
+    made = sampled_beams(FREQUENCY, **KINDS[kind](Dipoles()), absolute=True)
     grid = HemisphereGrid.gauss_legendre(12, 20)
     n = unit_vectors(grid)
     along = np.tensordot(arms, n, 1)
@@ -118,14 +123,14 @@ def test_rings_go_through_the_zenith():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_sampled_beams_keep_the_contract(kind):
-    source = replace(lb.sampled_beams(FREQUENCY, **embedded(kind)), turntable_offset_deg=5.0)
+    source = replace(sampled_beams(FREQUENCY, **embedded(kind)), turntable_offset_deg=5.0)
     turned = replace(source, turntable_offset_deg=35.0)
     sizes = {"frequency_mhz": FREQUENCY, "lmax": LMAX, "quadrature": SPLINES}
     check_beam_source(source, turned, turned_deg=30.0, **sizes)
 
 
 def modes_of(given, **more):
-    return lb.sampled_beams(FREQUENCY, **given, **more).beams(FREQUENCY, LMAX).modes
+    return sampled_beams(FREQUENCY, **given, **more).beams(FREQUENCY, LMAX).modes
 
 
 def test_the_scale_is_the_autos_or_the_files():
@@ -136,7 +141,7 @@ def test_the_scale_is_the_autos_or_the_files():
     np.testing.assert_allclose(autos.mean(), 1.0, rtol=1e-12)
     one, nine = (modes_of(g, absolute=True) for g in (given, bright))
     np.testing.assert_allclose(nine, 9.0 * one, rtol=1e-12, atol=1e-12 * np.abs(nine).max())
-    as_given = replace(lb.sampled_beams(FREQUENCY, **bright), normalise=False)
+    as_given = replace(sampled_beams(FREQUENCY, **bright), normalise=False)
     np.testing.assert_array_equal(as_given.beams(FREQUENCY, LMAX).modes, nine)
 
 
@@ -146,7 +151,7 @@ def test_files_come_back(tmp_path, kind, suffix):
     one, two = (embedded(kind, f) for f in (20.0, 30.0))
     angles = {name for name in one if name.endswith("deg")}
     arrays = {n: v if n in angles else np.stack([v, two[n]]) for n, v in one.items()}
-    made = lb.sampled_beams([20.0, 30.0], **arrays, absolute=True)
+    made = sampled_beams([20.0, 30.0], **arrays, absolute=True)
     path = write_sampled_beams(tmp_path / f"mine.{suffix}", made)
     again = read_beam(path)
     assert again.absolute
@@ -162,7 +167,7 @@ def test_files_come_back(tmp_path, kind, suffix):
 
 def test_a_scenario_takes_the_file(tmp_path):
     path = tmp_path / "mine.nc"
-    write_sampled_beams(path, lb.sampled_beams(FREQUENCY, **embedded("pixels")))
+    write_sampled_beams(path, sampled_beams(FREQUENCY, **embedded("pixels")))
     scenario = small_scenario(f"beam.file={path}")
     assert scenario.beam.model == "sampled"
     assert (scenario.beam.source().n_ports, scenario.beam.label) == (4, "mine.nc")
@@ -174,7 +179,7 @@ def test_a_scenario_takes_the_file(tmp_path):
 
 def test_product_beams_of_a_file_may_be_in_any_order(tmp_path):
     path = tmp_path / "mine.nc"
-    made = lb.sampled_beams(FREQUENCY, **embedded("products on pixels"))
+    made = sampled_beams(FREQUENCY, **embedded("products on pixels"))
     write_sampled_beams(path, made)
     order = np.random.default_rng(0).permutation(16)
     with xr.open_dataset(path, engine="h5netcdf") as file:
@@ -223,20 +228,20 @@ NO_BEAMS = [
 
 @pytest.mark.parametrize(("given", "words"), NO_BEAMS)
 def test_arrays_that_are_no_beams_are_refused(given, words):
-    refuse(words, lb.sampled_beams, FREQUENCY, **given())
+    refuse(words, sampled_beams, FREQUENCY, **given())
 
 
 def test_what_cannot_be_computed_is_refused():
-    zero = lb.sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
+    zero = sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
     refuse("autos integrate to 0 sr", zero.beams, FREQUENCY, 2)
     refuse("needs the E fields", zero.fields, FREQUENCY, HemisphereGrid.for_lmax(2))
     two = np.zeros((2, 16, 48))
-    refuse("frequency_mhz does not increase", lb.sampled_beams, [20.0, 10.0], products=two)
+    refuse("frequency_mhz does not increase", sampled_beams, [20.0, 10.0], products=two)
 
 
 @pytest.mark.parametrize("suffix", ["nc", "fits"])
 def test_a_file_has_to_say_whether_its_scale_is_absolute(tmp_path, suffix):
-    path, made = tmp_path / f"mine.{suffix}", lb.sampled_beams(FREQUENCY, **embedded("grid"))
+    path, made = tmp_path / f"mine.{suffix}", sampled_beams(FREQUENCY, **embedded("grid"))
     write_sampled_beams(path, made)
     if suffix == "fits":
         fits.delval(path, "ABSOLUTE")

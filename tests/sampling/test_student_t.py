@@ -15,6 +15,7 @@ import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout, auto_indices
 from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.runs.sample_run import coordinates, sample_together
+from lusee_bayes.sampling.distributions import TimesStudentT
 
 N_TIMES = 8
 FORMS = ["paper", "exact"]
@@ -48,19 +49,19 @@ def by_time(case, nu):
 
 @pytest.mark.parametrize("nu", [0.7, 4.0])
 def test_the_density_is_that_of_scipy(case, nu):
-    site = lb.TimesStudentT(case.loc, case.noise.factor(), case.layout, nu)
+    site = TimesStudentT(case.loc, case.noise.factor(), case.layout, nu)
     values = jnp.stack([case.value, 30.0 * case.value, case.loc])
     laws = list(by_time(case, nu))
     expected = [sum(law.logpdf(v[at]) for _, at, law in laws) for v in np.asarray(values)]
     np.testing.assert_allclose(site.log_prob(values), expected, rtol=1e-12)
-    for one in (site, lb.TimesStudentT(case.loc, case.noise, case.layout, jnp.asarray(nu))):
+    for one in (site, TimesStudentT(case.loc, case.noise, case.layout, jnp.asarray(nu))):
         np.testing.assert_allclose(one.log_prob(values[0]), expected[0], rtol=1e-12)
 
 
 def test_weights_are_means_given_the_residuals(case):
     """E[w_t] by quadrature: w ~ Gamma(nu / 2, nu / 2), d_t ~ N(loc_t, N_t / w)."""
     nu, dense = 3.0, np.asarray(case.noise.dense())
-    found = lb.TimesStudentT(case.loc, case.noise, case.layout, nu).weights(case.value)
+    found = TimesStudentT(case.loc, case.noise, case.layout, nu).weights(case.value)
     w = np.exp(np.linspace(-25.0, 5.0, 4001))
     expected = np.ones(N_TIMES)
     for t, at, _ in by_time(case, nu):
@@ -78,7 +79,7 @@ def test_residuals_have_the_misfits_slope(case):
     """J^T r is the gradient of the misfit, whose constants the density has."""
 
     def site(loc):
-        return lb.TimesStudentT(loc, case.noise, case.layout, 4.0)
+        return TimesStudentT(loc, case.noise, case.layout, 4.0)
 
     r, pull = jax.vjp(lambda loc: site(loc).residual(case.value), case.loc)
     slope = jax.jit(jax.grad(lambda loc: -site(loc).log_prob(case.value)))(case.loc)
@@ -88,7 +89,7 @@ def test_residuals_have_the_misfits_slope(case):
 def test_draws_follow_their_law(case):
     """chi^2_t / n_t ~ F(n_t, nu), times independent, covariances nu / (nu - 2) N."""
     nu, n = 10.0, 20_000
-    site = lb.TimesStudentT(case.loc, case.noise, case.layout, nu)
+    site = TimesStudentT(case.loc, case.noise, case.layout, nu)
     draws = site.sample(jax.random.key(3), (2, n // 2))
     assert draws.shape == (2, n // 2, case.layout.size)
     away = np.asarray(draws).reshape(n, -1) - np.asarray(case.loc)
@@ -111,7 +112,7 @@ def test_draws_follow_their_law(case):
 
 def test_noise_that_couples_times_is_refused(case):
     dense = DenseCovariance(jnp.asarray(case.noise.dense()))
-    site, complete = lb.TimesStudentT, DataLayout(4, N_TIMES)
+    site, complete = TimesStudentT, DataLayout(4, N_TIMES)
     refuse("correlation in time, not DenseCovariance", site, case.loc, dense, case.layout, 4.0)
     refuse("layout.*32 data.*mean 22", site, case.loc, case.noise, complete, 4.0)
     refuse("nu .*Student-t.*positive", site, case.loc, case.noise, case.layout, 0.0)

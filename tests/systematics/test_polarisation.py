@@ -22,6 +22,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, product_modes
 from lusee_bayes.instrument.beams.luseepy_files import read_response
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
+from lusee_bayes.instrument.beams.sampled import sampled_beams
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.polarisation import beam_scale
@@ -161,7 +162,7 @@ def test_without_it_the_map_fails_and_with_it_the_errors_are_right(kind):
 
 
 def test_what_cannot_be_is_refused():
-    beams = lb.sampled_beams(MHZ, products=np.ones((16, 12 * 4**2)))
+    beams = sampled_beams(MHZ, products=np.ones((16, 12 * 4**2)))
     setup = replace(setup_with(linear=0.01), beam_source=beams)
     why = "noise.polarisation: the beams: product beams, but this needs the E fields"
     refuse(why, model_about, setup, Around())
