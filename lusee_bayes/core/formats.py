@@ -102,7 +102,7 @@ SAMPLES = "lusee_bayes samples 1"
 BEAMS = "lusee_bayes beams 1"
 GAINS = "lusee_bayes gains 1"
 REDUCED = "lusee_bayes reduced spectra 2"
-DIAGNOSTICS = "lusee_bayes diagnostics 3"
+DIAGNOSTICS = "lusee_bayes diagnostics 4"
 CHANNEL = "lusee_bayes unfinished channel 1"
 PAPER_CASE = "lusee_bayes paper case 1"
 

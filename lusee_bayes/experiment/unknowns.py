@@ -45,6 +45,8 @@ from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 from lusee_bayes.systematics.sources import PointSources
 from lusee_bayes.systematics.systematic import Expanded, Truth
 
+# in sr
+WHOLE_SKY = 4.0 * np.pi
 # report a null direction that keeps more than WORTH of its prior variance, and its parts with
 # weights of at least PART
 WORTH, PART = 0.5, 0.2
@@ -220,8 +222,24 @@ class InstrumentPosterior:
 
 
 @dataclass(frozen=True)
+class Fluxes:
+    """Posterior of point sources, each as the mean temperature that it adds to the sky, in K.
+
+    names : of the sources; truth : NaN if unknown; with_sky : covariance with the sky, in K^2;
+    with_all : covariance of the sky, and of the sources, with all unknowns, in K
+    """
+
+    names: tuple[str, ...]
+    mean: Float[np.ndarray, " source"]
+    std: Float[np.ndarray, " source"]
+    truth: Float[np.ndarray, " source"]
+    with_sky: Float[np.ndarray, "source mode"]
+    with_all: Float[np.ndarray, "mode_or_source n"]
+
+
+@dataclass(frozen=True)
 class Unknowns:
-    """Posterior of the instrument's unknowns given the sky, for reports and for joint channels.
+    """Posterior of the unknowns beside the sky given it, for reports and for joint channels.
 
     Attributes
     ----------
@@ -261,7 +279,7 @@ class Unknowns:
         inference : Inference
             Inference from these data alone.
         """
-        held = [s for s in inference.expanded if not isinstance(s.systematic, PointSources)]
+        held = inference.expanded
         if not held:
             return None
         octaves, alike = [], []
@@ -293,6 +311,20 @@ class Unknowns:
     def shared_names(self) -> list[str]:
         """Names of the shared unknowns."""
         return [self.rows[k]["unknown"] for k in self.shared]
+
+    def fluxes(self, given: Amplitudes) -> Fluxes:
+        """The fluxes of sources that are constant in time, sky integrated out."""
+        table = given_data(pd.DataFrame(self.rows), given)
+        own = table["systematic"].eq(PointSources.words) & table["unknown"].eq(table["site"])
+        k = np.flatnonzero(own)
+        kelvin = table.loc[k].reindex(columns=["value", "std", "true", "prior_std"]) / WHOLE_SKY
+        scale = kelvin["prior_std"].to_numpy()[:, None]
+        return Fluxes(
+            tuple(name.removeprefix("flux_").replace("_", " ") for name in table["unknown"][k]),
+            *(kelvin[name].to_numpy() for name in ("value", "std", "true")),
+            scale * given.with_sky[:, k].T,
+            np.concatenate([given.with_sky, scale * given.covariance[k]]),
+        )
 
     def among(self, tied: Tied) -> list[int]:
         """Indices of the shared unknowns in ``tied``."""
@@ -361,7 +393,7 @@ class Unknowns:
 
     def instrument(
         self, mean: Modes, covariance: ModesMatrix, pixels: Pixels
-    ) -> tuple[InstrumentPosterior, dict[str, Float[np.ndarray, "modes kept"]]]:
+    ) -> tuple[InstrumentPosterior, dict[str, Float[np.ndarray, "modes_and_sources kept"]], Fluxes]:
         """Compute the posterior of all unknowns, and its effect on the map.
 
         Parameters
@@ -374,24 +406,30 @@ class Unknowns:
         Returns
         -------
         InstrumentPosterior
-        dict of (modes, kept) arrays
-            For each systematic, and all together, R of W V^-1 W^T = R R^T, the part of the sky's
-            covariance that would vanish if it were known.
+        dict of (modes + sources, kept) arrays
+            For each systematic, and all together, R of W V^-1 W^T = R R^T, the part of the
+            covariance of sky and fluxes that would vanish if it were known; that of fluxes only
+            for systematics other than the sources themselves.
+        Fluxes
         """
         given, total = self.amplitudes.integrated(mean, covariance), float(np.trace(covariance))
         rows = given_data(pd.DataFrame(self.rows), given)
 
         correlation = given.covariance / np.outer(given.std, given.std)
+        fluxes = self.fluxes(given)
+        with_all = fluxes.with_all / given.std
 
-        def root(which: Int[np.ndarray, " which"]) -> Float[np.ndarray, "modes kept"]:
+        def root(which: Int[np.ndarray, " which"]) -> Float[np.ndarray, "modes_and_sources kept"]:
             """R of W V^-1 W^T = R R^T."""
             values, axes = np.linalg.eigh(correlation[np.ix_(which, which)])
             kept = values > len(values) * np.finfo(np.float64).eps
-            return (given.with_sky / given.std)[:, which] @ (axes[:, kept] / np.sqrt(values[kept]))
+            return with_all[:, which] @ (axes[:, kept] / np.sqrt(values[kept]))
 
-        every = root(np.arange(len(rows)))
+        every, n = root(np.arange(len(rows))), len(mean)
         kinds = rows.groupby("systematic", sort=False).indices
         parts = {ALL_TOGETHER: every} | {name: root(at) for name, at in kinds.items()}
+        for name in {ALL_TOGETHER, PointSources.words}.intersection(parts):
+            parts[name][n:] = 0.0
         moved = (rows["value"] - rows["prior"]) / rows["prior_std"]
         squares = rows.assign(unknown=rows["site"], n=1, moved=moved**2, width=given.std**2)
         groups = squares.groupby(["systematic", "unknown"], sort=False)
@@ -404,11 +442,11 @@ class Unknowns:
         theta = InstrumentPosterior(
             table,
             rows.loc[corner].filter(UNKNOWN_COLUMNS).reset_index(drop=True),
-            {name: float((part**2).sum()) / total for name, part in parts.items()},
+            {name: float((part[:n] ** 2).sum()) / total for name, part in parts.items()},
             correlation[np.ix_(corner, corner)],
-            (pixel_std(every @ every.T, nside) / pixels) ** 2,
+            (pixel_std(every[:n] @ every[:n].T, nside) / pixels) ** 2,
         )
-        return theta, parts
+        return theta, parts, fluxes
 
     def _null_direction(self, posterior: Amplitudes, variance: float) -> NullDirection:
         mixed = self.parts @ posterior.with_sky[0] / self.sky_std
@@ -586,15 +624,22 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     """
     held = next(s for s in inference.expanded if isinstance(s.systematic, PointSources))
     fluxes = _alone(experiment, inference, held)
-    jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
+    frequency_mhz = experiment.scenario.frequency_mhz
+    jansky = 1.0 / kelvin_steradian(1.0, frequency_mhz)
     own = zip(experiment.scenario.sources.list, held.systematic.unknowns, strict=True)
     blocks = [(source.name, block) for source, flux in own for block in range(flux.size or 1)]
     table = pd.DataFrame(blocks, columns=["source", "block"])
     table["above_horizon"] = np.asarray(held.systematic.columns).any(0)
     in_jy = (fluxes.filter(["prior", "prior_std", "true"]) * jansky).add_suffix("_jy")
-    found = fluxes[["value", "std"]].rename(columns={"value": "flux"})
-    in_both = (found * jansky).add_suffix("_jy"), found.add_suffix("_k_sr")
-    return pd.concat([table, *in_both, in_jy], axis=1)
+    return pd.concat([table, in_both_units(fluxes, frequency_mhz), in_jy], axis=1)
+
+
+def in_both_units(unknowns: pd.DataFrame, frequency_mhz: float) -> pd.DataFrame:
+    """Value and std of the fluxes among unknowns, in Jy and in K sr."""
+    of_sources = unknowns[unknowns["systematic"] == PointSources.words].reset_index(drop=True)
+    found = of_sources[["value", "std"]].rename(columns={"value": "flux"})
+    in_jy = found / kelvin_steradian(1.0, frequency_mhz)
+    return pd.concat([in_jy.add_suffix("_jy"), found.add_suffix("_k_sr")], axis=1)
 
 
 def flux_lines(fluxes: pd.DataFrame) -> Iterator[str]:

@@ -157,11 +157,13 @@ def sample_page(folder: Path, name: str) -> str:
     )
 
 
-def comparison_page(runs: Sequence[FinishedRun], folder: Path) -> str:
-    """The page of a comparison of runs as text; ``folder`` has its figures."""
+def write_comparison(runs: Sequence[FinishedRun], folder: Path) -> None:
+    """Write the page of a comparison of runs into the folder of its figures."""
     pairs = zip(comparison_rows(runs), runs, strict=True)
     rows = [row | {"ell_cross": run.cross_in_words()} for row, run in pairs]
-    return render("comparison.html", folder, runs=runs, rows=rows, caveat=evidence_caveat(runs))
+    more = {"rows": rows, "caveat": evidence_caveat(runs)}
+    page = render("comparison.html", folder, runs=runs, **more)
+    (folder / "comparison.html").write_text(page, encoding="utf-8")
 
 
 REPORT = "report.html"

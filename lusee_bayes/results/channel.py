@@ -18,7 +18,12 @@ from lusee_bayes.core.checks import Described, extent
 from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.diagnosis import Diagnosis
-from lusee_bayes.experiment.unknowns import InstrumentPosterior, PointingReport, UnknownsReport
+from lusee_bayes.experiment.unknowns import (
+    InstrumentPosterior,
+    PointingReport,
+    UnknownsReport,
+    in_both_units,
+)
 from lusee_bayes.judge import measures
 from lusee_bayes.judge.chi2 import HEADLINES, ChiSquare, Fit, Level
 from lusee_bayes.judge.coverage import Coverage
@@ -186,10 +191,13 @@ class ChannelData:
     departure: Departure | None = None
 
     def given(self, table: pd.DataFrame) -> ChannelData:
-        """Replace the offsets by those in a table of unknowns, given all channels."""
-        if self.pointing is None or self.pointing.offsets is None:
-            return self
-        return replace(self, pointing=self.pointing.given(table))
+        """Replace offsets and fluxes by those in a table of unknowns, given all channels."""
+        pointing, fluxes = self.pointing, self.fluxes
+        if pointing is not None and pointing.offsets is not None:
+            pointing = pointing.given(table)
+        if fluxes is not None:
+            fluxes = fluxes.assign(**in_both_units(table, self.frequency_mhz))
+        return replace(self, pointing=pointing, fluxes=fluxes)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

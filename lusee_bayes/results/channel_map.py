@@ -36,7 +36,7 @@ from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.results.channel import ChannelData, ChannelResult, Details, Judged
 from lusee_bayes.results.finished_runs import SavedInformation, taken
 from lusee_bayes.results.map_result import prior_sentence
-from lusee_bayes.results.sky_spectrum import Departure, RegionTemperatures
+from lusee_bayes.results.sky_spectrum import Columns, Departure, RegionTemperatures, WithSky
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference
 
@@ -280,7 +280,7 @@ class Conditioned:
         fitting = experiment.fitting
         altitude, departure = measures.highest_altitude(data.observation, scenario.map_nside), None
         if not joint:
-            departure = Departure.of(altitude, self.posterior, self.covariance, self._shared_root())
+            departure = Departure.of(altitude, self.posterior, *self._shared())
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
             taken=taken(data.observation),
@@ -312,14 +312,15 @@ class Conditioned:
             departure=departure,
         )
 
-    def _shared_root(self) -> Float[np.ndarray, "modes shared"]:
-        """Root of the covariance that would vanish if what channels share were known, in K."""
+    def _shared(self) -> tuple[WithSky, Columns]:
+        """Covariance and w of :class:`.Departure`, in K^2 and K."""
         if self.unknowns is None:
-            return np.zeros((len(self.covariance), 0))
+            return self.covariance, np.zeros((len(self.covariance), 0))
         given = self.unknowns.amplitudes.integrated(self.posterior.mean, self.covariance)
-        shared = self.unknowns.shared
+        shared, fluxes = self.unknowns.shared, self.unknowns.fluxes(given)
         lower = np.linalg.cholesky(given.covariance[np.ix_(shared, shared)])
-        return solve_lower(lower, given.with_sky[:, shared].T, transpose=False).T
+        w = solve_lower(lower, fluxes.with_all[:, shared].T, transpose=False).T
+        return np.concatenate([self.covariance, fluxes.with_sky]), w
 
     def _judged(self, misfit: Residuals) -> Judged:
         """Describe the residuals, with the verdict in words."""
@@ -348,7 +349,7 @@ def channel_result(
     *,
     pixels: Pixels | None = None,
     instrument: Unknowns | None = None,
-    common: Float[np.ndarray, "modes white"] | None = None,
+    common: Columns | None = None,
     joint: Float[np.ndarray, "all modes"] | None = None,
     covariance_kept: bool = False,
     information_bits: float = np.nan,
@@ -368,7 +369,7 @@ def channel_result(
         Standard deviations of pixels in K; computed if omitted.
     instrument : Unknowns, optional
         Unknowns of the instrument given the sky, where the model has them.
-    common : (modes, white) array, optional
+    common : (modes + sources, white) array, optional
         Root of the covariance with other channels, as of :class:`.RegionTemperatures`.
     joint : (all, modes) array, optional
         Draws of the sky in a posterior of all channels, in K.
@@ -385,12 +386,12 @@ def channel_result(
         held = Counts.of_pixels(width, data.truth - mean, np.asarray(compared)).coverage()
     power = data.prior_std**2
     share = np.divide(variance, power, out=np.zeros(len(variance)), where=power > 0)
-    report, theta, roots = None, None, {}
+    report, theta, roots, fluxes = None, None, {}, None
     if instrument is not None:
         report = instrument.report(mean, covariance, joint=joint is not None)
-        theta, roots = instrument.instrument(mean, covariance, width)
+        theta, roots, fluxes = instrument.instrument(mean, covariance, width)
     options = {"truth": data.truth, "roots": roots, "common": common, "draws": joint}
-    options |= {"departure": data.departure}
+    options |= {"departure": data.departure, "fluxes": fluxes if joint is None else None}
     return ChannelResult(
         **(vars(data) | {"doubts": (*data.doubts, *about_information(information_bits))}),
         **figures,

@@ -38,7 +38,7 @@ from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.map_result import MapResult, spectrum_of
-from lusee_bayes.results.sky_spectrum import IndexMaps, SkySpectrum
+from lusee_bayes.results.sky_spectrum import SkySpectrum
 
 
 def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
@@ -90,12 +90,12 @@ def write_map(
     _write_columns(path, columns, cards("maps", scenario))
 
 
-def write_index_maps(path: Path, found: IndexMaps, scenario: Scenario) -> None:
-    """Write maps of the spectral index as the columns of a HEALPix file."""
-    units = {"turnover": "MHz", "turnover_std": "MHz"}
+def write_index_maps(result: MapResult, folder: Path) -> None:
+    """Write maps of the spectral index as index.fits, the columns of a HEALPix file."""
+    units, found = {"turnover": "MHz", "turnover_std": "MHz"}, result.index_maps()
     columns = [(name, pixels, units.get(name, "")) for name, pixels in found.maps.items()]
     reference = {"FREQREF": (found.reference_mhz, "frequency of the index in MHz")}
-    _write_columns(path, columns, cards("index", scenario) | reference)
+    _write_columns(folder / "index.fits", columns, cards("index", result.scenario) | reference)
 
 
 def _write_columns(

@@ -56,8 +56,8 @@ def joint_prior_sentence(scenario: Scenario) -> str:
 
 def spectrum_of(channels: Sequence[ChannelResult]) -> SkySpectrum:
     """Temperatures of regions of the sky in all channels."""
-    frequencies = [channel.frequency_mhz for channel in channels]
-    return SkySpectrum.of(frequencies, [channel.temperatures for channel in channels])
+    each = [(one.frequency_mhz, one.temperatures, one.departure) for one in channels]
+    return SkySpectrum.of(*zip(*each, strict=True))
 
 
 def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:

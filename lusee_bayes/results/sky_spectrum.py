@@ -27,6 +27,7 @@ from functools import lru_cache
 import numpy as np
 from astropy.table import Table
 from jaxtyping import Bool, Float
+from scipy.linalg import block_diag
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
 from lusee_bayes.core.errors import InputError, nearest
@@ -34,20 +35,23 @@ from lusee_bayes.core.harmonics import averaging_rows, lmax_of, per_mode, pixel_
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.trees import quantity
-from lusee_bayes.experiment.unknowns import ALL_TOGETHER
+from lusee_bayes.experiment.unknowns import ALL_TOGETHER, WHOLE_SKY, Fluxes
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.galaxy import kelvin_steradian
 
 Frequencies = Float[np.ndarray, " frequency"]
 Rows = Float[np.ndarray, "area mode"]
-Columns = Float[np.ndarray, "mode shared"]
+WithSky = Float[np.ndarray, "mode_or_source mode"]
+Columns = Float[np.ndarray, "mode_or_source shared"]
 
 # Galactic latitudes that bound caps and plane, in degrees
 CAP, PLANE = 60.0, 10.0
 # resolution of regions
 NSIDE = 64
 OBSERVED = "observed sky"
+CAPS = f"cap b > {CAP:g}", f"cap b < -{CAP:g}"
+REGIONS = "mean sky", OBSERVED, *CAPS, f"plane |b| < {PLANE:g}"
 UNOBSERVED, UNMEASURED = "unobserved sky", "unmeasured structure"
 # draws of a joint posterior that the correlation of its channels is computed from
 N_DRAWS = 400
@@ -67,13 +71,9 @@ def sky_regions(highest_altitude: Pixels) -> dict[str, Bool[np.ndarray, " fine"]
     """
     nside = max(NSIDE, healpy.npix2nside(len(highest_altitude)))
     _, latitude = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
-    return {
-        "mean sky": np.ones(len(latitude), dtype=bool),
-        OBSERVED: healpy.ud_grade(highest_altitude, nside) >= 0.0,
-        f"cap b > {CAP:g}": latitude > CAP,
-        f"cap b < -{CAP:g}": latitude < -CAP,
-        f"plane |b| < {PLANE:g}": np.abs(latitude) < PLANE,
-    }
+    whole, observed = np.full(len(latitude), True), healpy.ud_grade(highest_altitude, nside) >= 0.0
+    caps, plane = (latitude > CAP, latitude < -CAP), np.abs(latitude) < PLANE
+    return dict(zip(REGIONS, (whole, observed, *caps, plane), strict=True))
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ class Departure:
     ----------
     mean : (white,) array
         Posterior mean of u, the sky's departure from the prior in prior standard deviations.
-    error : (regions, white) array
-        L E: how each region's temperature misses u.
+    error : (regions + sources, white) array
+        L E: how each region's temperature misses u, and the temperature of each point source.
     """
 
     mean: Float[np.ndarray, " white"] = quantity("1", "departure of the sky from its prior")
@@ -93,7 +93,7 @@ class Departure:
 
     @classmethod
     def of(
-        cls, highest_altitude: Pixels, posterior: Posterior, covariance: ModesMatrix, w: Columns
+        cls, highest_altitude: Pixels, posterior: Posterior, covariance: WithSky, w: Columns
     ) -> Departure:
         """Compute it from a posterior given a channel's own data.
 
@@ -102,31 +102,30 @@ class Departure:
         highest_altitude : (pixels,) array
         posterior : Posterior
             With the channel's prior.
-        covariance : (modes, modes) array
-            In K^2.
-        w : (modes, shared) array
+        covariance : (modes + sources, modes) array
+            Of the sky and of :class:`.Fluxes` with the sky, in K^2.
+        w : (modes + sources, shared) array
             Root of the part of it that would vanish if what channels share were known, in K.
         """
         prior, mean = posterior.prior, np.asarray(posterior.mean)
-        rows = averaging_rows(np.stack([*sky_regions(highest_altitude).values()]), lmax_of(len(w)))
-        error = np.asarray(prior.whiten(rows @ covariance - (rows @ w) @ w.T))
+        n, inside = len(mean), np.stack([*sky_regions(highest_altitude).values()])
+        rows = block_diag(averaging_rows(inside, lmax_of(n)), np.eye(len(w) - n))
+        error = np.asarray(prior.whiten(rows @ covariance - (rows @ w) @ w[:n].T))
         return cls(np.asarray(prior.whiten(mean) - prior.white_mean), error)
 
 
 @dataclass(frozen=True)
 class RegionTemperatures:
-    """RegionTemperatures of regions in one channel.
+    """Temperatures of regions in one channel, and of point sources: their means over the sky.
 
     Attributes
     ----------
     regions, sources : tuple of str
-        Names of the regions, and of the unknowns behind ``shares``.
+        Names of the regions and point sources, and of the unknowns behind ``shares``.
     mean, std : (regions,) array
     truth : (regions,) array or None
     common : (regions, shared) array
         L W: change per unit of the shared unknowns.
-    departure : Departure or None
-        None in a joint posterior.
     shares : (sources, regions) array
         Fraction of each variance that would vanish if an unknown were known: a systematic, or the
         sky that never rises; and the fraction from E u. The fractions need not add up.
@@ -143,7 +142,6 @@ class RegionTemperatures:
     std: Float[np.ndarray, " area"] = quantity("K", "standard deviation")
     truth: Float[np.ndarray, " area"] | None = quantity("K", "true temperature")
     common: Float[np.ndarray, "area shared"] = quantity("K", "root of the shared covariance")
-    departure: Departure | None
     shares: Float[np.ndarray, "source area"] = quantity("1", "fraction of the variance")
     draws: Float[np.ndarray, "joint_draw area"] = quantity("K", "draws of a joint posterior")
     cells: Float[np.ndarray, "cell_draw cell"] | None = quantity("K", "draws in cells of the sky")
@@ -160,6 +158,7 @@ class RegionTemperatures:
         common: Columns | None = None,
         departure: Departure | None = None,
         draws: Float[np.ndarray, "draw mode"] | None = None,
+        fluxes: Fluxes | None = None,
     ) -> RegionTemperatures:
         """Compute them from a posterior of the sky.
 
@@ -170,42 +169,43 @@ class RegionTemperatures:
         mean, covariance : (modes,) and (modes, modes) array
             In K and K^2.
         truth : (modes,) array, optional
-        roots : mapping of (modes, kept) arrays
+        roots : mapping of (modes + sources, kept) arrays
             For each systematic, R of the part R R^T of the covariance that would vanish if it were
             known.
-        common : (modes, shared) array, optional
+        common : (modes + sources, shared) array, optional
             W.
         departure : Departure, optional
         draws : (draws, modes) array, optional
             Of a joint posterior.
+        fluxes : Fluxes, optional
+            Of point sources.
         """
-        regions = sky_regions(highest_altitude)
-        inside, lmax = np.stack([*regions.values()]), lmax_of(len(mean))
+        regions, n = sky_regions(highest_altitude), len(mean)
+        inside, lmax = np.stack([*regions.values()]), lmax_of(n)
         rows, never = averaging_rows(inside, lmax), inside & ~regions[OBSERVED]
         hidden = (never.sum(1) / inside.sum(1))[:, None] * averaging_rows(never, lmax)
+        if fluxes is None:
+            fluxes = Fluxes((), *[np.zeros(0)] * 3, np.zeros((0, n)), np.zeros((n, 0)))
 
         def variance(rows: Rows) -> Float[np.ndarray, " area"]:
             return np.einsum("rm,rm->r", rows @ covariance, rows)
 
-        total = variance(rows)
-        parts = {name: ((rows @ root) ** 2).sum(1) for name, root in roots.items()}
-        parts[UNOBSERVED] = variance(hidden)
+        both = block_diag(rows, np.eye(len(fluxes.names)))
+        std = np.append(np.sqrt(variance(rows)), fluxes.std)
+        parts = {name: ((both @ root[: both.shape[1]]) ** 2).sum(1) for name, root in roots.items()}
+        parts[UNOBSERVED] = np.append(variance(hidden), 0.0 * fluxes.std)
         if departure is not None:
             parts[UNMEASURED] = (departure.error**2).sum(1)
-        none = np.zeros((0, len(mean)))
-        draws = none if draws is None else draws
-        cells = draws[:INDEX_DRAWS] @ _cell_rows(lmax).T if len(draws) else None
         return cls(
-            tuple(regions),
+            (*regions, *fluxes.names),
             tuple(parts),
-            rows @ mean,
-            np.sqrt(total),
-            None if truth is None else rows @ truth,
-            rows @ (none.T if common is None else common),
-            departure,
-            np.stack([*parts.values()]) / total,
-            draws @ rows.T,
-            cells,
+            np.append(rows @ mean, fluxes.mean),
+            std,
+            None if truth is None else np.append(rows @ truth, fluxes.truth),
+            np.zeros((len(std), 0)) if common is None else both @ common,
+            np.stack([*parts.values()]) / std**2,
+            np.zeros((0, len(std))) if draws is None else draws @ rows.T,
+            None if draws is None else draws[:INDEX_DRAWS] @ _cell_rows(lmax).T,
         )
 
 
@@ -222,7 +222,7 @@ class SkySpectrum:
     Attributes
     ----------
     regions, sources : tuple of str
-        As of :class:`RegionTemperatures`.
+        As of :class:`RegionTemperatures`; point sources are missing from a joint posterior.
     frequency : (frequencies,) array
     temperature : (regions, frequencies) array
     covariance : (regions, frequencies, frequencies) array
@@ -244,9 +244,12 @@ class SkySpectrum:
 
     @classmethod
     def of(
-        cls, frequencies_mhz: Sequence[float], channels: Sequence[RegionTemperatures]
+        cls,
+        frequencies_mhz: Sequence[float],
+        channels: Sequence[RegionTemperatures],
+        departures: Sequence[Departure | None],
     ) -> SkySpectrum:
-        """Combine the temperatures of all channels."""
+        """Combine the temperatures of all channels; without departures in a joint posterior."""
         first = channels[0]
         std, common = np.stack([c.std for c in channels]), np.stack([c.common for c in channels])
         if len(first.draws):
@@ -254,9 +257,9 @@ class SkySpectrum:
             correlation = np.stack([np.atleast_2d(np.corrcoef(of_region)) for of_region in drawn])
             covariance = correlation * np.einsum("fr,gr->rfg", std, std)
         else:
-            errors = np.stack([c.departure.error for c in channels])
+            errors = np.stack([one.error for one in departures])
             covariance = np.einsum("frw,grw->rfg", common, common)
-            u = np.stack([c.departure.mean / np.linalg.norm(c.departure.mean) for c in channels])
+            u = np.stack([one.mean / np.linalg.norm(one.mean) for one in departures])
             covariance += u @ u.T * np.einsum("frw,grw->rfg", errors, errors)
             covariance[:, *np.diag_indices(len(channels))] = std.T**2
         # an unknown that a channel lacks takes no part in its errors
@@ -292,12 +295,19 @@ class SkySpectrum:
             raise InputError(f"no region '{region}'; {nearest(region, self.regions)}")
         return self.regions.index(region)
 
+    @property
+    def jansky(self) -> Frequencies:
+        """Flux density of a point source whose temperature is 1 K, in Jy, at each frequency."""
+        return WHOLE_SKY / kelvin_steradian(1.0, self.frequency)
+
     def rows(self, region: str) -> tuple[list[str], list[list[str]]]:
-        """Header and rows of a region's spectrum for a terminal."""
-        k = self.place(region)
-        columns = {"T [K]": self.temperature[k], "+- [K]": self.std[k]}
+        """Header and rows of a region's spectrum, in K, or a point source's, in Jy."""
+        k, kelvin = self.place(region), region in REGIONS
+        name, unit, scale = ("T", "K", 1.0) if kelvin else ("S", "Jy", self.jansky)
+        columns = {name: self.temperature[k], "+-": self.std[k]}
         if self.truth is not None:
-            columns["true [K]"] = self.truth[k]
+            columns["true"] = self.truth[k]
+        columns = {f"{column} [{unit}]": scale * value for column, value in columns.items()}
         most = [f"{self.sources[j]} {self.shares[j, k, i]:.0%}" for i, j in enumerate(self.most(k))]
         cells = [[f"{value:,.1f}" for value in one] for one in columns.values()]
         mhz = [f"{value:g}" for value in self.frequency]

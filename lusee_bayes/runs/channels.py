@@ -422,7 +422,8 @@ class ChannelAlone:
         covariance = tied.covariance[number][np.ix_(at, at)]
         key = jax.random.fold_in(draw_key(scenario), TIED + 1)
         e, v = posterior.mean[shared], posterior.covariance[np.ix_(shared, shared)]
-        gain = np.linalg.solve(v, posterior.with_sky[:, shared].T).T
+        of_all = np.linalg.solve(v, self.unknowns.fluxes(posterior).with_all[:, shared].T).T
+        gain = of_all[: len(self.mean)]
         moved = self.mean + gain @ (mean - e)
         left = self.covariance + gain @ (covariance - v) @ gain.T
         # amplitudes that match the channel's own draws, minus their mean
@@ -455,7 +456,7 @@ class ChannelAlone:
             draws=skies,
             log_likelihood=information.log_likelihood(skies),
             instrument=unknowns,
-            common=gain @ tied.root[number, at],
+            common=of_all @ tied.root[number, at],
             **(self.figures | information.fit(moved, left) | {"information_bits": float(bits)}),
         )
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.report.figures.maps import map_fidelity, maps_of_runs
-from lusee_bayes.report.pages import comparison_page
+from lusee_bayes.report.pages import write_comparison
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, read_runs
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
 
@@ -39,14 +39,10 @@ def run_compare(
         return run.write(read_runs(folders), stages or Stages())
 
 
-def _write_page(runs: list[FinishedRun], folder: Path) -> None:
-    (folder / "comparison.html").write_text(comparison_page(runs, folder), encoding="utf-8")
-
-
 # contents of the folder of a comparison; a new file is one line here
 COMPARISON = RunKind(
     "compare",
-    outputs=(Output(_write_page), Output.rows("comparison.csv", comparison_rows)),
+    outputs=(Output(write_comparison), Output.rows("comparison.csv", comparison_rows)),
     figures={
         "maps": maps_of_runs,
         "curves": lambda runs: map_fidelity({run.name: run.channel for run in runs}),

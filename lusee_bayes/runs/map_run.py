@@ -139,10 +139,6 @@ def _write_spectrum(result: MapResult, folder: Path) -> None:
     Output.ecsv("spectrum.ecsv", lambda result: result.sky_spectrum().table()).write(result, folder)
 
 
-def _write_index(result: MapResult, folder: Path) -> None:
-    finished_runs.write_index_maps(folder / "index.fits", result.index_maps(), result.scenario)
-
-
 # contents of the folder of a map; a new file is one line here
 MAP = RunKind(
     "map",
@@ -153,7 +149,9 @@ MAP = RunKind(
         Output(_write_coefficients, wanted=lambda result: result.single),
         Output.ecsv("power_spectra.ecsv", lambda result: result.spectra()),
         Output(_write_spectrum, wanted=lambda result: not result.single),
-        Output(_write_index, wanted=lambda result: result.index_maps() is not None),
+        Output(
+            finished_runs.write_index_maps, wanted=lambda result: result.index_maps() is not None
+        ),
         Output.table("sources.csv", lambda result: result.table("fluxes")),
         Output.table("pointing.csv", lambda result: result.table("pointing", "offsets")),
         Output.table("pointing_by_day.csv", lambda result: result.table("pointing", "preferred")),

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from assertions import assert_same_map, within
 from reference_linear import Answer, random_covariance, white_posterior
@@ -19,6 +20,7 @@ from lusee_bayes.report.figures.judgement import corner
 from lusee_bayes.results.sky_spectrum import UNOBSERVED, sky_regions
 from lusee_bayes.runs import channels
 from lusee_bayes.runs.channels import Share, kernel, map_channels, tie_channels
+from lusee_bayes.sky.galaxy import kelvin_steradian
 
 FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
 RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
@@ -28,9 +30,13 @@ SMALL = (
     "noise.beam={parameters: {zenith_angle_deg: 1.0, surface_permittivity: 0.2}}",
     f"noise.receiver={{power_k: 20000, slope: -2, relative_std: 0.5, smooth_octaves: {OCTAVES}}}",
     *("noise.radiometer.factor=1e6", "output.draws=5", "prior={model: isotropic, spectrum: sky}"),
+    *("sky.sources=false", "sources={list: [{name: Cas A}, {name: Vir A, block_h: 500}]}"),
 )
 N_MODES, SAME = 36, ["zenith_angle_deg", "surface_permittivity"]
 ANGLES = ["turntable_0_deg", "turntable_1_deg"]
+# unknowns of a channel's own: Cas A, Vir A in three blocks, and four receivers
+FLUXES, OWN = 4, 8
+RECEIVERS = FLUXES + np.arange(4)
 # of three values that all channels share, and of four smooth ones
 ALL = np.ones((3, 3))
 SMOOTH = np.exp(-(np.log2(FREQUENCIES[:, None] / FREQUENCIES) ** 2) / (2.0 * OCTAVES**2))
@@ -134,7 +140,7 @@ def cube(scenario, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def dense(scenario):
-    """Skies, shared values and receivers about what each channel's own data tell of them."""
+    """Skies, shared values, fluxes and receivers about what each channel's own data tell."""
     skies, same, own, rest, noise, stds, constant = [], [], [], [], [], [], 0.0
     expectations, begin = [], None
     for channel in scenario.channels():
@@ -159,14 +165,17 @@ def dense(scenario):
     # volumes exp(e^T z) of all channels together make the prior's mean their sum
     before = e[:4]
     rows = np.concatenate([block_diag(*skies), np.concatenate(same), block_diag(*own)], axis=1)
-    unmixed = block_diag(np.eye(3 * N_MODES + 4), np.kron(np.linalg.cholesky(SMOOTH), np.eye(4)))
-    prior = np.concatenate([*stds, np.ones(16)])
+    is_flux = np.diag(np.arange(OWN) < FLUXES)
+    mixed = np.kron(np.linalg.cholesky(SMOOTH), np.eye(OWN) - is_flux)
+    unmixed = block_diag(np.eye(3 * N_MODES + 4), np.kron(np.eye(3), is_flux) + mixed)
+    prior = np.concatenate([*stds, np.ones(4 + 3 * OWN)])
     left = np.concatenate(rest) - np.concatenate(same) @ before
     white = white_posterior(rows @ unmixed, prior, np.concatenate(noise), left)
     mean = unmixed @ white.mean
     mean[3 * N_MODES :][:4] += before
     log_prob = white.log_prob + before @ before / 2.0 + constant
-    return Answer(mean, unmixed @ white.covariance @ unmixed.T, log_prob), skies, noise, stds
+    seen = [np.hstack([a, t[:, :FLUXES]]) for a, t in zip(skies, own, strict=True)]
+    return Answer(mean, unmixed @ white.covariance @ unmixed.T, log_prob), seen, noise, stds
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +201,7 @@ def test_tables_have_the_shared_values(cube, expected):
         z = (table["value"] - table["prior"]) / table["prior_std"]
         z = np.concatenate([z[:2], offsets["value"] / offsets["prior_std"], z[2:]])
         width = (one["std"] / one["prior_std"] for one in (table[:2], offsets, table[2:]))
-        mine = np.r_[:4, 4 + 4 * k : 8 + 4 * k]
+        mine = np.r_[:4, 4 + OWN * k + RECEIVERS]
         within((z - expected.mean[shared][mine]) / std[shared][mine], 0.0, 1e-6)
         np.testing.assert_allclose(np.concatenate(list(width)), std[shared][mine], rtol=1e-6)
 
@@ -204,9 +213,10 @@ def test_temperatures_of_all_channels_are_those_of_one_gaussian(cube, expected, 
     """
     missed, u = [], []
     for k, (a, noise, std) in enumerate(zip(*dense[1:], strict=True)):
-        left = np.linalg.inv(np.diag(std**-2.0) + a.T @ (a / noise[:, None] ** 2))
-        missed.append(left / std)
-        u.append(cube.channels[k].temperatures.departure.mean)
+        before = np.append(std, np.ones(FLUXES))
+        left = np.linalg.inv(np.diag(before**-2.0) + a.T @ (a / noise[:, None] ** 2))
+        missed.append(left[:, :N_MODES] / std)
+        u.append(cube.channels[k].departure.mean)
     alike = np.inner(u, u) / np.outer(*[np.linalg.norm(u, axis=1)] * 2)
     assert (alike[0, 1:] > 0.5).all()
     spectrum, first = cube.sky_spectrum(), cube.channel
@@ -218,7 +228,7 @@ def test_temperatures_of_all_channels_are_those_of_one_gaussian(cube, expected, 
         rows = block_diag(*[row] * 3)
         covariance = rows @ expected.covariance[: 3 * N_MODES, : 3 * N_MODES] @ rows.T
         scale = np.sqrt(np.diagonal(covariance))
-        error = np.stack([row @ one for one in missed])
+        error = np.stack([row @ one[:N_MODES] for one in missed])
         covariance += np.where(np.eye(3) == 1, 0.0, alike * (error @ error.T))
         off = spectrum.temperature[k] - rows @ expected.mean[: 3 * N_MODES]
         within(off / scale, 0.0, 1e-6)
@@ -232,6 +242,34 @@ def test_temperatures_of_all_channels_are_those_of_one_gaussian(cube, expected, 
         gone = cross @ np.linalg.solve(expected.covariance[np.ix_(known, known)], cross.T)
         share = spectrum.shares[spectrum.sources.index("the beams"), k]
         np.testing.assert_allclose(share, np.diagonal(gone) / scale**2, rtol=1e-4)
+    # a point source is the mean temperature that it adds to the sky
+    table = pd.concat([channel.fluxes[:1] for channel in cube.channels])
+    at, k = 3 * N_MODES + 4 + OWN * np.arange(3), spectrum.place("Cas A")
+    assert k == len(regions) == len(spectrum.regions) - 1
+    flux = table["prior_jy"] + table["prior_std_jy"] * expected.mean[at]
+    error = np.stack([one[N_MODES] for one in missed])
+    covariance = expected.covariance[np.ix_(at, at)]
+    covariance += np.where(np.eye(3) == 1, 0.0, alike * (error @ error.T))
+    covariance *= np.outer(*[table["prior_std_jy"]] * 2)
+    scale = np.sqrt(np.diagonal(covariance))
+    per_kelvin = kelvin_steradian(1.0, FREQUENCIES) / (4.0 * np.pi)
+    within((table["flux_jy"] - flux) / scale, 0.0, 1e-6)
+    within((spectrum.temperature[k] / per_kelvin - flux) / scale, 0.0, 1e-6)
+    found = spectrum.covariance[k] / np.outer(per_kelvin, per_kelvin)
+    within((found - covariance) / np.outer(scale, scale), 0.0, 1e-6)
+    np.testing.assert_allclose(table["std_jy"], scale, rtol=1e-6)
+    np.testing.assert_allclose(spectrum.truth[k] / per_kelvin, table["true_jy"], rtol=1e-12)
+    known = 3 * N_MODES + np.arange(2)
+    cross = expected.covariance[np.ix_(at, known)]
+    gone = cross @ np.linalg.solve(expected.covariance[np.ix_(known, known)], cross.T)
+    gone = np.diagonal(gone) / expected.std[at] ** 2
+    share = spectrum.shares[:, k]
+    np.testing.assert_allclose(share[spectrum.sources.index("the beams")], gone, rtol=1e-4)
+    assert not share[spectrum.sources.index("the sources")].any()
+    # its errors at two frequencies are alike
+    assert (np.abs(covariance[0, 1:] / scale[0] / scale[1:]) > 0.01).any()
+    header, rows = spectrum.rows("Cas A")
+    assert header[1] == "S [Jy]" and float(rows[0][1].replace(",", "")) == round(flux.iloc[0], 1)
     # unknowns that channels share make their errors alike
     assert (spectrum.covariance[0, 0, 1:] > 1e-3 * spectrum.std[0, 0] * spectrum.std[0, 1:]).any()
     off = spectrum.temperature[0] - np.array(
@@ -246,9 +284,10 @@ def test_theta_adds_the_variance_that_fixing_it_would_take_away(cube, expected):
     for k, channel in enumerate(cube.channels):
         sky, theta = np.arange(k * N_MODES, (k + 1) * N_MODES), channel.theta
         shared = 3 * N_MODES + np.arange(4)
-        receivers = 3 * N_MODES + 4 + 4 * k + np.arange(4)
-        parts = {ALL_TOGETHER: np.r_[shared, receivers], "the beams": shared[:2]}
-        parts |= {"clock and pointing": shared[2:], "the receivers": receivers}
+        own = 3 * N_MODES + 4 + OWN * k + np.arange(OWN)
+        parts = {ALL_TOGETHER: np.r_[shared, own], "the beams": shared[:2]}
+        parts |= {"clock and pointing": shared[2:], "the sources": own[:FLUXES]}
+        parts |= {"the receivers": own[FLUXES:]}
         before = expected.covariance[np.ix_(sky, sky)]
         for name, at in parts.items():
             cross, own = expected.covariance[np.ix_(sky, at)], expected.covariance[np.ix_(at, at)]
@@ -260,10 +299,12 @@ def test_theta_adds_the_variance_that_fixing_it_would_take_away(cube, expected):
                 share /= np.einsum("mp,mn,np->p", grid, before, grid)
                 np.testing.assert_allclose(theta.pixel_share, share, rtol=1e-4)
         assert set(theta.shares) == set(parts) and 0.01 < theta.shares[ALL_TOGETHER] < 1.0
-        same = parts[ALL_TOGETHER]
+        # without the blocks of time, which the table has as one row
+        same, blocks = np.delete(parts[ALL_TOGETHER], [5, 6, 7]), parts["the sources"][1:]
         scale = np.outer(expected.std[same], expected.std[same])
         within(theta.correlation, expected.covariance[np.ix_(same, same)] / scale, 1e-6)
-        np.testing.assert_allclose(theta.table["width"], expected.std[same], rtol=1e-6)
+        widths = np.insert(expected.std[same], 5, np.sqrt(np.mean(expected.std[blocks] ** 2)))
+        np.testing.assert_allclose(theta.table["width"], widths, rtol=1e-6)
         assert list(theta.corner["unknown"][:4]) == [*SAME, *ANGLES]
     assert not disagreement(cube.shared_tests) and len(cube.shared_tests) == 3
     assert cube.fit.level == "consistent"

@@ -25,7 +25,7 @@ from lusee_bayes.report.figures.drawing import BLUE, COLOURS, DIVERGING, GREY, L
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.map_result import MapResult
-from lusee_bayes.results.sky_spectrum import MEASURED, PUBLISHED, Frequencies, SkySpectrum
+from lusee_bayes.results.sky_spectrum import MEASURED, PUBLISHED, REGIONS, Frequencies, SkySpectrum
 
 # figures shown side by side, or below each other on a phone, by their titles
 Panels = dict[str, Figure]
@@ -307,7 +307,7 @@ def spectrum_figure(spectrum: SkySpectrum, tables: Sequence[Path] = ()) -> Figur
     f = spectrum.frequency
     grid = np.geomspace(f.min(), f.max(), 200)
     figure, axes = drawing.framed((5.6, 4.6))
-    for k, (region, std) in enumerate(zip(spectrum.regions, spectrum.std, strict=True)):
+    for k, (region, std) in enumerate(zip(REGIONS, spectrum.std, strict=False)):
         style = {"color": f"C{k}", "fmt": ".", "ms": 4, "lw": 1, "label": region}
         axes.errorbar(f, spectrum.temperature[k], std, **style)
         if spectrum.truth is not None:
