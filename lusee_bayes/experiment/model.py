@@ -16,6 +16,7 @@ import numpy as np
 
 from lusee_bayes.core.arrays import Grid, ModesMatrix, on_device, on_host
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
@@ -26,6 +27,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, KnownFactor, LowRankUpdate
 from lusee_bayes.noise.radiometer import radiometer_noise
+from lusee_bayes.sky.sky_source import Sky
 from lusee_bayes.systematics.above_lmax import AboveLmax, sky_above
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities, prior_and_family
 from lusee_bayes.systematics.gain_drifts import GainDrifts
@@ -99,7 +101,9 @@ def set_up(
     return with_sky_above(setup.with_signal())
 
 
-def with_sky_above(setup: Setup, covariance: ModesMatrix | None = None) -> Setup:
+def with_sky_above(
+    setup: Setup, covariance: ModesMatrix | None = None, values: Truth | None = None
+) -> Setup:
     """Add the sky above lmax to a setup, if it is part of the model.
 
     Parameters
@@ -107,11 +111,26 @@ def with_sky_above(setup: Setup, covariance: ModesMatrix | None = None) -> Setup
     setup : Setup
     covariance : (modes, modes) array, optional
         Prior covariance of all modes up to the highest ell, learned from the data, in K^2.
+    values : dict, optional
+        Of the instrument that sees it.
     """
     if AboveLmax.treatment(setup.scenario) is None:
         return setup
-    noise = on_host(radiometer(setup)).factor()
-    return replace(setup, above=sky_above(setup, noise, covariance))
+    noise, coupling = on_host(radiometer(setup)).factor(), _coupling_above(setup, values or {})
+    return replace(setup, above=sky_above(setup, coupling, noise, covariance))
+
+
+def _coupling_above(setup: Setup, values: Truth) -> CouplingMatrix:
+    """A of all modes up to the highest ell that is seen, for these values of the instrument."""
+    scenario = setup.scenario.with_section("sources", list=())
+    top = scenario.noise.above_lmax.top(scenario.lmax)
+    beams = setup.beam_source.beams(setup.frequency_mhz, top)
+    coupling = CouplingMatrix.build(beams, Pointing.of(setup.observation, top), setup.layout)
+    sky = Sky(np.zeros(n_modes(top)), setup.frequency_mhz)
+    whole = replace(setup, scenario=scenario, sky=sky, beams=beams, coupling=coupling, hidden=None)
+    for cls, section in present(scenario):
+        whole = cls.moved(section, whole, values)
+    return whole.coupling
 
 
 def require_fitting(data: Visibilities, scenario: Scenario) -> None:
@@ -160,12 +179,25 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     return noise.scaled(around.tempered)
 
 
-def moved(setup: Setup, values: Truth | None) -> Setup:
-    """The setup with these values of the instrument, and its signal for them."""
+def moved(setup: Setup, values: Truth | None, *, above: bool = False) -> Setup:
+    """The setup with these values of the instrument, and its signal for them.
+
+    Parameters
+    ----------
+    setup : Setup
+    values : dict or None
+    above : bool
+        Whether A of the sky above lmax is needed for them, too.
+    """
     made = setup
     for cls, section in present(setup.scenario) if values else ():
         made = cls.moved(section, made, values)
-    return setup if made is setup else made.with_signal()
+    if made is setup:
+        return setup
+    if above and setup.above is not None:
+        seen = replace(setup.above, coupling=_coupling_above(setup, values))
+        made = replace(made, above=seen)
+    return made.with_signal()
 
 
 def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, Systematic]]:
@@ -175,7 +207,7 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
     are: gains and sources then belong to the corrected pointing.
     """
     around = around or Around()
-    moved_setup = moved(setup, around.values)
+    moved_setup = moved(setup, around.values, above=True)
     return [
         (treatment, cls.build(section, moved_setup, around))
         for cls, section in present(setup.scenario)
@@ -313,7 +345,7 @@ def true_values(setup: Setup) -> Truth:
 def true_model(setup: Setup, truth: Truth) -> LinearGaussian:
     """The model of simulated data: true instrument, true values and radiometer noise."""
     key = jax.random.key(setup.scenario.seed)
-    true = moved(setup, truth)
+    true = moved(setup, truth, above=True)
     model = LinearGaussian(true.coupling, setup.prior, radiometer(setup), true.offset)
     for cls, section in present(setup.scenario):
         model = cls.in_data(section, true, model, truth, key)

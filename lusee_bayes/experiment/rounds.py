@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lusee_bayes.core.arrays import DataVector, Grid, Modes, Vector
+from lusee_bayes.core.arrays import DataVector, Grid, Modes, ModesMatrix, Vector
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
 from lusee_bayes.experiment.model import model_about, moved, with_sky_above
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
+from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes, variance_factor
 from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
 from lusee_bayes.linear.posterior import Posterior
@@ -67,6 +67,8 @@ VOLUME_DRAWS = 8
 SAME_VISIBILITIES = 0.1
 # steps that oscillate are halved, down to this fraction of the full step
 SHORTEST = 0.125
+# prior standard deviation of ln of the variance of the sky above lmax, whose scale is extrapolated
+LOG_LEVEL_STD = 0.5
 
 
 @dataclass(frozen=True)
@@ -546,12 +548,25 @@ def with_learned_prior(
                 family = replace(as_strong, mean=family.mean, wide=family.wide)
             else:
                 first = setup.family.start_from(coarse, learned.parameters)
-            setup = with_sky_above(setup, averaged_beyond(family, coarse, learned.scores))
+            covariance = averaged_beyond(family, coarse, learned.scores)
+            setup = _levelled(with_sky_above(setup, covariance, start.values), covariance, start)
     result = settled(setup, start, learn, report)
     if surveys:
         learned = _compared_surveys(setup, whole(result.solution.information), result.learned)
         result = replace(result, learned=learned)
     return replace(setup, prior=result.learned.prior), result
+
+
+def _levelled(setup: Setup, covariance: ModesMatrix, around: Around) -> Setup:
+    """Scale the expected sky above lmax to the level that the data themselves suggest."""
+    n, above = setup.prior.size, setup.above
+    prior = setup.family.prior(covariance[:n, :n])
+    found = _conditioned(replace(setup, prior=prior), around, 1, None)
+    terms = (part.systematic for part in found.systematics)
+    root = next(term for term in terms if isinstance(term, AboveLmax)).root
+    level = variance_factor(template_amplitudes(found.solution, root), LOG_LEVEL_STD)
+    above = replace(above, root=above.root * np.sqrt(level), power=above.power * level)
+    return replace(setup, above=above)
 
 
 def _compared_surveys(setup: Setup, information: Information, learned: Learned) -> Learned:

@@ -61,6 +61,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cho_solve
+from scipy.optimize import minimize_scalar
 
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Square, Vector
 from lusee_bayes.core.checks import require_shape
@@ -76,6 +77,8 @@ PatternModes = Float[np.ndarray, "patterns modes"]
 
 # leading data that are compared first, to find a column among many
 FEW = 8
+# largest change of ln of a variance
+LONGEST = 3.0
 
 
 @dataclass(frozen=True)
@@ -289,6 +292,24 @@ def template_amplitudes(solution: Solution, templates: Float[Array, "data n"]) -
     """
     of_sky = AmplitudesOfSky.of(solution, templates)
     return of_sky.integrated(solution.posterior.mean, solution.covariance)
+
+
+def variance_factor(given: Amplitudes, log_std: float) -> float:
+    """The most probable factor s of the prior variance of all amplitudes, ln s ~ N(0, log_std^2).
+
+    ::
+
+        ln p(d | s) = ln p(d | 1) + ln E[N(z; 0, s) / N(z; 0, 1)],    z ~ N(mean, covariance).
+    """
+    widths, axes = np.linalg.eigh(given.covariance)
+    squares = (axes.T @ given.mean) ** 2
+
+    def misfit(log_s: float) -> float:
+        more = np.expm1(-log_s)
+        left = 1.0 + more * widths
+        return float((log_s + np.log(left) + more * squares / left).sum() + (log_s / log_std) ** 2)
+
+    return float(np.exp(minimize_scalar(misfit, bounds=(-LONGEST, LONGEST), method="bounded").x))
 
 
 class Patterns(eqx.Module):

@@ -5,11 +5,12 @@
     d = A m + A' m' + n,    m' ~ N(mu', S'),
 
 where m' are the modes from lmax + 1 up to the highest ell seen (:meth:`AboveLmaxSection.top`), S'
-is their part of the prior's covariance, and A' is for the expected instrument. Integrating m' out
-adds A' mu' to the mean of the data, and A' S' A'^T to N. This omits directions that together change
-chi^2 by less than one, and the correlation of m' with m, through which the data constrain m' better
-than N assumes. If the prior is learned, S' is the mean over its uncertain parameters, those learned
-up to lmax and, for smaller scales, further ones from the hyperprior.
+is their part of the prior's covariance, and A' is that of the instrument as inferred. Integrating
+m' out adds A' mu' to the mean of the data, and A' S' A'^T to N. This omits directions that together
+change chi^2 by less than one, and the correlation of m' with m, through which the data constrain m'
+better than N assumes. If the prior is learned, S' is the mean over its uncertain parameters, those
+learned up to lmax and, for smaller scales, further ones from the hyperprior, times the factor that
+the data prefer (:func:`.variance_factor`).
 
 Simulated data contain the modes of the scenario's sky up to the same ell.
 """
@@ -27,7 +28,6 @@ from lusee_bayes.core.harmonics import LARGEST_LMAX
 from lusee_bayes.core.linalg import checked_cholesky, times_lower
 from lusee_bayes.core.section import Section, Treatment
 from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.noise.covariance import Factor
 from lusee_bayes.systematics.context import Above, Around, Setup
 from lusee_bayes.systematics.systematic import LowRankNoise, with_added
@@ -75,7 +75,7 @@ class AboveLmax(LowRankNoise):
 
     @classmethod
     def build(cls, section: AboveLmaxSection, setup: Setup, around: Around) -> AboveLmax:
-        return cls("above_lmax", setup.layout, setup.above.root, setup.above.mean)
+        return cls("above_lmax", setup.layout, *setup.above.seen)
 
     @classmethod
     def truth(cls, section, setup, key):
@@ -85,8 +85,9 @@ class AboveLmax(LowRankNoise):
     @classmethod
     def in_data(cls, section, setup, model, truth, key):
         """Add the modes of the scenario's sky."""
-        coupling = _coupling(setup, section.top(setup.scenario.lmax))
-        return with_added(model, coupling @ setup.above.modes)
+        above = setup.above
+        below = np.zeros(above.coupling.shape[1] - len(above.modes))
+        return with_added(model, above.coupling @ np.concatenate([below, above.modes]))
 
     def effect(self, model, values):
         return with_added(super().effect(model, values), self.mean)
@@ -96,25 +97,28 @@ class AboveLmax(LowRankNoise):
         return with_added(super().marginalised(model), self.mean)
 
 
-def sky_above(setup: Setup, noise: Factor, learned: ModesMatrix | None = None) -> Above:
+def sky_above(
+    setup: Setup, coupling: CouplingMatrix, noise: Factor, learned: ModesMatrix | None = None
+) -> Above:
     """Compute the possible contribution of the sky above lmax to the data.
 
     Parameters
     ----------
     setup : Setup
+    coupling : CouplingMatrix
+        A of all modes up to the highest ell.
     noise : Factor
         Of the radiometer noise.
     learned : (modes, modes) array, optional
         Prior covariance of all modes, learned from the data, in K^2; by default the expected one.
     """
-    scenario, n, above = setup.scenario, setup.prior.size, setup.above
-    frequency_mhz, lmax = scenario.frequency_mhz, scenario.noise.above_lmax.top(scenario.lmax)
+    scenario, n, above, lmax = setup.scenario, setup.prior.size, setup.above, coupling.lmax
     if above is None:
-        sky = scenario.sky.at(frequency_mhz, lmax)
-        family = scenario.prior.family(frequency_mhz, lmax)
-        coupling, modes = _coupling(setup, lmax), np.asarray(sky.modes)[n:]
+        sky = scenario.sky.at(scenario.frequency_mhz, lmax)
+        family = scenario.prior.family(scenario.frequency_mhz, lmax)
+        modes = np.asarray(sky.modes)[n:]
     else:
-        coupling, modes, family = above.coupling, above.modes, above.family
+        modes, family = above.modes, above.family
     if family is None:
         prior = scenario.prior.prior(sky)
         covariance, mean = prior.covariance(), prior.mean
@@ -122,15 +126,16 @@ def sky_above(setup: Setup, noise: Factor, learned: ModesMatrix | None = None) -
         covariance, mean = learned, family.mean
         if learned is None:
             covariance = family.at(family.hyperprior.start()).covariance
-    white = np.array(noise.whiten(coupling))
+    white = np.array(noise.whiten(np.asarray(coupling.dense())[:, n:]))
     covariance = np.asarray(covariance)[n:, n:]
     power = (white**2).sum(0) * np.diagonal(covariance)
     power = np.add.reduceat(power, np.arange(scenario.lmax + 1, lmax + 1) ** 2 - n)
     root = checked_cholesky("the prior above lmax", covariance)
     white = times_lower(white, root, transpose=False)
-    root = coupling @ (root @ _main_directions(white))
-    added = np.zeros(len(coupling)) if mean is None else coupling @ np.asarray(mean)[n:]
-    return Above(coupling, modes, family, root, added, power)
+    directions = np.pad(root @ _main_directions(white), ((n, 0), (0, 0)))
+    expected = np.zeros(len(directions)) if mean is None else np.array(mean)
+    expected[:n] = 0.0
+    return Above(coupling, modes, family, directions, expected, power)
 
 
 def _main_directions(white: Float[np.ndarray, "data modes"]) -> Float[np.ndarray, "modes few"]:
@@ -139,10 +144,3 @@ def _main_directions(white: Float[np.ndarray, "data modes"]) -> Float[np.ndarray
     basis, triangle = np.linalg.qr(white.T)
     squares, directions = np.linalg.eigh(triangle @ triangle.T)
     return basis @ directions[:, np.searchsorted(np.cumsum(squares), LEFT_OUT) :]
-
-
-def _coupling(setup: Setup, lmax: int) -> Float[np.ndarray, "data modes"]:
-    """A', of the modes above the setup's lmax."""
-    beams = setup.beam_source.beams(setup.frequency_mhz, lmax)
-    coupling = CouplingMatrix.build(beams, Pointing.of(setup.observation, lmax), setup.layout)
-    return np.asarray(coupling.dense())[:, setup.prior.size :]

@@ -11,7 +11,7 @@ has neither problem.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -43,26 +43,32 @@ class Above:
 
     Attributes
     ----------
-    coupling : (data, modes) array
-        A of the modes there.
+    coupling : CouplingMatrix
+        A of all modes up to the highest ell. Modes below have zeros in the arrays that follow.
     modes : (modes,) array
         Of the modelled sky, in K.
     family : PriorFamily or None
         Priors up to the highest ell, from which data choose one; None for a given prior.
-    root : (data, rank) array
-        Of the covariance of the contribution, in K.
-    mean : (data,) array
+    root : (all, rank) array
+        Of the part of the covariance that the data can tell from zero, in K.
+    mean : (all,) array
         Its mean, in K.
     power : (ells,) array
         Expected contribution of each ell from lmax + 1 on to chi^2 of a model without it.
     """
 
-    coupling: Float[Array, "data modes"]
+    coupling: CouplingMatrix
     modes: Modes
     family: PriorFamily | None
-    root: Float[Array, "data rank"]
-    mean: DataVector
+    root: Float[np.ndarray, "all rank"]
+    mean: Float[np.ndarray, " all"]
     power: Float[np.ndarray, " ells"]
+
+    @property
+    def seen(self) -> tuple[Float[Array, "data rank"], DataVector]:
+        """Root and mean of the contribution to the data, in K."""
+        seen = self.coupling @ np.concatenate([self.root, self.mean[:, None]], axis=1)
+        return seen[:, :-1], seen[:, -1]
 
 
 @dataclass(frozen=True)
@@ -188,34 +194,34 @@ class Setup:
 
     def with_layout(self, layout: DataLayout) -> Setup:
         """Return the same for a subset of its data."""
-        coupling = replace(self.coupling, layout=layout)
-        return replace(self, coupling=coupling, above=self._above_at(layout))
+        return self._with_couplings(lambda coupling: replace(coupling, layout=layout))
 
-    def _above_at(self, layout: DataLayout, keep: Any = np.s_[:]) -> Above | None:
-        """The sky above lmax in the data of another layout, which has only the times ``keep``."""
-        if self.above is None:
-            return None
-        names = ("coupling", "root", "mean")
-        grids = {name: self.layout.scatter(getattr(self.above, name)) for name in names}
-        return replace(self.above, **{n: layout.gather(grid[:, keep]) for n, grid in grids.items()})
+    def _with_couplings(self, changed: Callable[[CouplingMatrix], CouplingMatrix]) -> Setup:
+        """Change A, also that of the sky above lmax."""
+        above = self.above
+        if above is not None:
+            above = replace(above, coupling=changed(above.coupling))
+        return replace(self, coupling=changed(self.coupling), above=above)
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Setup:
         """Return the same at the times where ``keep`` is True, with some of every run."""
-        observation, turns = self.observation.select(keep), self.pointing
+        observation, calibration = self.observation.select(keep), self.calibration
         ends = np.searchsorted(observation.run, np.arange(observation.n_runs + 1)).tolist()
-        of_time = {"azimuth": turns.azimuth[keep], "functions": turns.functions[keep]}
-        pointing = replace(turns, **of_time, run_starts=tuple(ends))
         layout = DataLayout.from_flags(~np.asarray(self.layout.present)[:, keep])
-        calibration = self.calibration
+
+        def changed(coupling: CouplingMatrix) -> CouplingMatrix:
+            turns = coupling.pointing
+            of_time = {"azimuth": turns.azimuth[keep], "functions": turns.functions[keep]}
+            pointing = replace(turns, **of_time, run_starts=tuple(ends))
+            return replace(coupling, pointing=pointing, layout=layout)
+
         return replace(
-            self,
+            self._with_couplings(changed),
             observation=observation,
-            coupling=replace(self.coupling, pointing=pointing, layout=layout),
             responses=tuple(grid[:, keep] for grid in self.responses),
             background=self.background[:, keep],
             signal=self.signal[:, keep],
             calibration=None if calibration is None else calibration.select(keep),
-            above=self._above_at(layout, keep),
         )
 
     @property

@@ -1,5 +1,6 @@
 """Systematics from scenario to map: marginalised they cost little, ignored they ruin everything."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import jax.numpy as jnp
@@ -70,6 +71,25 @@ def test_the_signal_of_an_instrument_with_other_values_is_its_own(name):
     got = np.asarray(there.layout.gather(there.signal))
     within(got, seen, 1e-12 * np.abs(seen).max())
     assert np.abs(got - setup.layout.gather(setup.signal)).max() > 1e-4 * np.abs(seen).max()
+
+
+@pytest.mark.parametrize("name", MOVES)
+def test_the_sky_above_lmax_is_seen_by_the_instrument_with_its_values(name):
+    """In N and in simulated data, with A of a scenario that goes as high; and A differs."""
+    above = "noise.above_lmax={margin: 3, least_lmax: 0}"
+    setup = small_experiment(MOVES[name], above, lmax=4, cycles=0.05).setup
+    values = true_values(setup)
+    expected = models.moved(small_experiment(MOVES[name], lmax=7, cycles=0.05).setup, values)
+    a, n = np.asarray(expected.coupling.dense()), setup.prior.size
+    (term,) = (s for _, s in models.systematics(setup, Around(values=values)) if hasattr(s, "root"))
+    root = setup.above.root[n:]
+    within(term.root, a[:, n:] @ root, 1e-11 * np.abs(term.root).max())
+    assert np.abs(term.root - setup.above.seen[0]).max() > 1e-4 * np.abs(term.root).max()
+    sky, ends = setup.sky.modes, setup.scenario.with_section("noise", above_lmax=None)
+    flat = replace(setup, scenario=ends, above=None)
+    whole, below = (models.true_model(one, values).predict(sky) for one in (setup, flat))
+    added = np.asarray(whole - below)
+    within(added, a[:, n:] @ setup.above.modes, 1e-12 * np.abs(whole).max())
 
 
 @pytest.mark.essential

@@ -10,10 +10,12 @@ import pytest
 import reference_linear as oracle
 from assertions import refuse
 from jaxtyping import TypeCheckError
+from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.linear.amplitudes import template_amplitudes, variance_factor
 from lusee_bayes.linear.information import CONVERGENCE
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap, form_of
 from lusee_bayes.noise.covariance import DenseCovariance, LowRankCovariance
@@ -383,3 +385,24 @@ def test_beside_a_solved_model_columns_are_changed(before, after, gain):
     assert np.abs((found.posterior.mean - expected.mean) / expected.std).max() < WELL_SCALED
     np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-10)
     assert float(found.posterior.log_evidence) == pytest.approx(expected.log_prob, abs=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.5, 3.0])
+def test_the_variance_of_columns_is_where_the_density_of_data_is_largest(size):
+    """ln p(d | s) - ln^2 s / (2 std^2) of dense matrices, on a grid of s."""
+    rng, n = np.random.default_rng(6), 40
+    a, u = rng.normal(size=(n, N_MODES)), rng.normal(size=(n, 12))
+    s, noise = np.diag(per_mode(SPECTRUM)), np.diag(rng.uniform(0.5, 2.0, n))
+    signal = a @ np.linalg.cholesky(s) @ rng.normal(size=N_MODES) + size * u @ rng.normal(size=12)
+    data = signal + np.sqrt(np.diag(noise)) * rng.normal(size=n)
+    base = lb.DiagonalCovariance(jnp.asarray(np.diag(noise))) + LowRankCovariance(jnp.asarray(u))
+    model = lb.LinearGaussian(jnp.asarray(a), lb.HarmonicPrior(jnp.asarray(SPECTRUM)), base)
+    found = template_amplitudes(model.condition(jnp.asarray(data)), u)
+    factors, known = np.exp(np.linspace(-2.9, 2.9, 101)), a @ s @ a.T + noise
+    tried = [multivariate_normal.logpdf(data, cov=known + f * u @ u.T) for f in factors]
+    for std in (0.3, 10.0):
+        best = int(np.argmax(np.array(tried) - 0.5 * (np.log(factors) / std) ** 2))
+        assert factors[best - 1] < variance_factor(found, std) < factors[best + 1]
+    # twelve columns tell their variance to 40 %; a narrow prior keeps it near one
+    assert 0.4 < variance_factor(found, 10.0) / size**2 < 2.5
+    assert abs(np.log(variance_factor(found, 0.3) / size**2)) > 0.1
