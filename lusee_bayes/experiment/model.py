@@ -195,8 +195,7 @@ def moved(setup: Setup, values: Truth | None, *, above: bool = False) -> Setup:
     if made is setup:
         return setup
     if above and setup.above is not None:
-        seen = replace(setup.above, coupling=_coupling_above(setup, values))
-        made = replace(made, above=seen)
+        made = replace(made, above=replace(setup.above, coupling=_coupling_above(setup, values)))
     return made.with_signal()
 
 

@@ -562,9 +562,8 @@ def _levelled(setup: Setup, covariance: ModesMatrix, around: Around) -> Setup:
     n, above = setup.prior.size, setup.above
     prior = setup.family.prior(covariance[:n, :n])
     found = _conditioned(replace(setup, prior=prior), around, 1, None)
-    terms = (part.systematic for part in found.systematics)
-    root = next(term for term in terms if isinstance(term, AboveLmax)).root
-    level = variance_factor(template_amplitudes(found.solution, root), LOG_LEVEL_STD)
+    (term,) = (s.systematic for s in found.systematics if isinstance(s.systematic, AboveLmax))
+    level = variance_factor(template_amplitudes(found.solution, term.root), LOG_LEVEL_STD)
     above = replace(above, root=above.root * np.sqrt(level), power=above.power * level)
     return replace(setup, above=above)
 

@@ -28,10 +28,10 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
-from lusee_bayes.core.arrays import DataVector, Modes, ModesMatrix, Pixels, Square, Vector
+from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, Square, Vector
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import base_model, radiometer, true_values
+from lusee_bayes.experiment.model import base_model, true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
@@ -514,8 +514,6 @@ def tested_offsets(setup: Setup) -> dict[str, float]:
 
 # if there are more days, they form groups of equal length
 MOST_STRETCHES = 31
-# acceptable rms of the terms beyond first order, over radiometer noise
-NEGLIGIBLE = 0.1
 
 
 @dataclass(frozen=True)
@@ -525,8 +523,8 @@ class PointingReport:
     Attributes
     ----------
     offsets : DataFrame or None
-        One row per offset of the model: offset, value, std, prior_std, beyond_first_order (rms,
-        over radiometer noise) and, if known, true. None without offsets.
+        One row per offset of the model: offset, value, std, prior_std and, if known, true. None
+        without offsets.
     preferred : DataFrame
         Additional offsets that the data prefer, one row per offset for all days and for each group
         of days: offset, first_day and last_day (-1 for all), value, std and chi2_gain.
@@ -544,11 +542,7 @@ class PointingReport:
     def lines(self) -> Iterator[str]:
         """One line per offset."""
         for row in [] if self.offsets is None else self.offsets.to_dict("records"):
-            left = row["beyond_first_order"]
-            text = f"{_line(row['offset'], row)}; beyond first order: {left:.1g} of the noise"
-            if left > NEGLIGIBLE:
-                text += ", too much: set noise.pointing.treatment=sampled"
-            yield text
+            yield _line(row["offset"], row)
 
 
 def pointing_report(experiment: Experiment, inference: Inference) -> PointingReport:
@@ -560,27 +554,13 @@ def pointing_report(experiment: Experiment, inference: Inference) -> PointingRep
     inference : Inference
         Inference from these data alone.
     """
-    table = None if inference.offsets is None else _table(experiment, inference)
-    values = {} if table is None else dict(zip(table["offset"], table["value"], strict=True))
+    table, values = None, {}
+    if inference.offsets is not None:
+        table = _alone(experiment, inference, inference.offsets)
+        table = table.rename(columns={"unknown": "offset"})
+        table = table.filter(["offset", "value", "std", "prior_std", "true"])
+        values = dict(zip(table["offset"], table["value"], strict=True))
     return PointingReport(table, _preferred(experiment, inference, values))
-
-
-def _table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
-    table = _alone(experiment, inference, inference.offsets)
-    shares = np.asarray(table["std"] / table["prior_std"])  # remaining uncertainty of the offsets
-    noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
-    model, mean = base_model(experiment.setup), inference.posterior.mean
-    offsets = inference.offsets.systematic
-
-    def seen(z: Vector) -> DataVector:
-        return np.asarray(offsets.effect(model, offsets.values(z)).predict(mean))
-
-    # the mean of steps to either side has no first order
-    middle = seen(0.0 * shares)
-    left = [(seen(z) + seen(-z)) / 2.0 - middle for z in np.diag(shares)]
-    beyond = [float(np.sqrt(np.mean((one / noise) ** 2))) for one in left]
-    table = table.assign(beyond_first_order=beyond).rename(columns={"unknown": "offset"})
-    return table.filter(["offset", "value", "std", "prior_std", "beyond_first_order", "true"])
 
 
 def _preferred(experiment: Experiment, result: Inference, values: dict[str, float]) -> pd.DataFrame:
@@ -625,13 +605,13 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     held = next(s for s in inference.expanded if isinstance(s.systematic, PointSources))
     fluxes = _alone(experiment, inference, held)
     frequency_mhz = experiment.scenario.frequency_mhz
-    jansky = 1.0 / kelvin_steradian(1.0, frequency_mhz)
     own = zip(experiment.scenario.sources.list, held.systematic.unknowns, strict=True)
     blocks = [(source.name, block) for source, flux in own for block in range(flux.size or 1)]
     table = pd.DataFrame(blocks, columns=["source", "block"])
     table["above_horizon"] = np.asarray(held.systematic.columns).any(0)
-    in_jy = (fluxes.filter(["prior", "prior_std", "true"]) * jansky).add_suffix("_jy")
-    return pd.concat([table, in_both_units(fluxes, frequency_mhz), in_jy], axis=1)
+    in_jy = fluxes.filter(["prior", "prior_std", "true"]) / kelvin_steradian(1.0, frequency_mhz)
+    found = in_both_units(fluxes, frequency_mhz)
+    return pd.concat([table, found, in_jy.add_suffix("_jy")], axis=1)
 
 
 def in_both_units(unknowns: pd.DataFrame, frequency_mhz: float) -> pd.DataFrame:

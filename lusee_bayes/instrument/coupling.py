@@ -510,13 +510,11 @@ class CouplingMatrix(Coupling):
         for run, part in self._parts():
             x_and_y = self.by_order[run] @ both
             x_and_y = x_and_y.reshape(len(both), n_products, n_functions, -1)
-            functions = self.pointing.functions[part]
             cosine, sine = _phases(self.pointing.azimuth[part], self.lmax)
             over_time = xp.tensordot(cosine, x_and_y[..., :half], 1)
             over_time = over_time + xp.tensordot(sine, x_and_y[..., half:], 1)
-            grids.append(xp.einsum("tpfn,tf->ptn", over_time, functions))
-        grid = xp.concatenate(grids, axis=1)
-        return self.layout.gather(grid).reshape(-1, *sky.shape[1:])
+            grids.append(xp.einsum("tpfn,tf->ptn", over_time, self.pointing.functions[part]))
+        return self.layout.gather(xp.concatenate(grids, axis=1)).reshape(-1, *sky.shape[1:])
 
     @compiled
     def _backward(self, data: Float[Array, "data *n"]) -> Float[Array, "modes *n"]:

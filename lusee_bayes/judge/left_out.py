@@ -19,10 +19,10 @@ With N = N_0 + T T^T, F = [T, A S^(1/2)], and D = N_0^-1, whose blocks are the d
 
 Rows of A at nearby times are combinations of the rows at a few of them, A_s = U A_few
 (:func:`.spanning_rows`), so that c^T U = q r gives W = q (r F_few L^-T). In a day of ten-minute
-samples the few are an eighth; the few of all days in a stretch of ``DAYS`` days are in turn spanned
-by a few of theirs. L^-T and Q^-1 are applied to the rows of a stretch, once for all groups within
-it and for the diagonal of K^-1. Up to ``SHARED`` times are one stretch; if D couples their
-products, or A has no structure in time, Y L^-T of all data is kept.
+samples the few are an eighth, in a stretch of ``DAYS`` days still fewer. L^-T and Q^-1 are applied
+to the rows of a stretch, once for all groups within it and for the diagonal of K^-1. Up to
+``SHARED`` times are one stretch; if D couples their products, or A has no structure in time, Y L^-T
+of all data is kept.
 
 **A large group** is removed from Q, without rows of A if A and N have structure in time::
 
@@ -41,7 +41,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
-from scipy.linalg import block_diag
 
 from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Grid, GridFlags, Square, Vector, on_host
@@ -312,7 +311,8 @@ class LeftOut:
         else:
             missing = np.unique(self._stretch_of[np.isnan(self._lost[:, 0])])
             in_threads(self._stretch, missing.tolist())
-        precision = diagonal_of(self._weights)
+        w = self._weights
+        precision = w if w.ndim == 2 else np.diagonal(w, axis1=1, axis2=2)
         precision = np.where(precision > self._lost, precision - self._lost, np.nan)
         return self._layout.scatter(self._cells.gather(precision.T))
 
@@ -439,26 +439,16 @@ class LeftOut:
         return Stretch(times, half.swapaxes(0, 1), sky.swapaxes(0, 1), span.factors)
 
     def _span(self, times: Int[np.ndarray, " n"]) -> Span:
-        """A few times that span all of these: first for every day, then for all days."""
-        key = times.tobytes()
-        if key not in self._spans:
-            days = np.split(times, np.flatnonzero(np.diff(self._day[times])) + 1)
-            if len(days) == 1:
-                self._spans[key] = self._spanning(times)
-            else:
-                every = [self._span(day) for day in days]
-                few, again = self._spanning(np.concatenate([span.few for span in every]))
-                self._spans[key] = Span(few, block_diag(*(span.factors for span in every)) @ again)
+        """A few times that span all of these."""
+        if (key := times.tobytes()) not in self._spans:
+            templates = self._t[times].reshape(len(times), -1)
+            templates = templates / np.maximum(np.abs(templates).max(axis=0), 1e-300)
+            features = [self._model.coupling.time_features(times), templates]
+            starts = self._model.coupling.pointing.run_starts
+            run = np.searchsorted(starts, times, side="right")
+            few, factors = linalg.spanning_rows(np.concatenate(features, axis=1), run)
+            self._spans[key] = Span(times[few], factors)
         return self._spans[key]
-
-    def _spanning(self, times: Int[np.ndarray, " n"]) -> Span:
-        pointing = self._model.coupling.pointing
-        templates = self._t[times].reshape(len(times), -1)
-        templates = templates / np.maximum(np.abs(templates).max(axis=0), 1e-300)
-        features = [self._model.coupling.time_features(times), templates]
-        run = np.searchsorted(pointing.run_starts, times, side="right")
-        few, factors = linalg.spanning_rows(np.concatenate(features, axis=1), run)
-        return Span(times[few], factors)
 
     # --- groups in the space of their data ----------------------------------------------------
 
@@ -533,11 +523,6 @@ class LeftOut:
 def pieces(n: int) -> list[Int[np.ndarray, " part"]]:
     """The numbers 0 to n - 1 in pieces of at most ``CHUNK``."""
     return np.array_split(np.arange(n), -(-n // CHUNK))
-
-
-def diagonal_of(blocks: np.ndarray) -> Cells:
-    """The diagonals of blocks, which may be diagonals already."""
-    return blocks if blocks.ndim == 2 else np.diagonal(blocks, axis1=1, axis2=2)
 
 
 def weigh(weights: Weights, x: Float[np.ndarray, "blocks places k"]) -> np.ndarray:

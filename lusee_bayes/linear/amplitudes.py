@@ -77,8 +77,6 @@ PatternModes = Float[np.ndarray, "patterns modes"]
 
 # leading data that are compared first, to find a column among many
 FEW = 8
-# largest change of ln of a variance
-LONGEST = 3.0
 
 
 @dataclass(frozen=True)
@@ -297,6 +295,8 @@ def template_amplitudes(solution: Solution, templates: Float[Array, "data n"]) -
 def variance_factor(given: Amplitudes, log_std: float) -> float:
     """The most probable factor s of the prior variance of all amplitudes, ln s ~ N(0, log_std^2).
 
+    It is at least e^-3 and at most e^3.
+
     ::
 
         ln p(d | s) = ln p(d | 1) + ln E[N(z; 0, s) / N(z; 0, 1)],    z ~ N(mean, covariance).
@@ -309,7 +309,7 @@ def variance_factor(given: Amplitudes, log_std: float) -> float:
         left = 1.0 + more * widths
         return float((log_s + np.log(left) + more * squares / left).sum() + (log_s / log_std) ** 2)
 
-    return float(np.exp(minimize_scalar(misfit, bounds=(-LONGEST, LONGEST), method="bounded").x))
+    return float(np.exp(minimize_scalar(misfit, bounds=(-3.0, 3.0), method="bounded").x))
 
 
 class Patterns(eqx.Module):

@@ -87,10 +87,6 @@ class Posterior(Described, eqx.Module):
         rows = harmonics.synthesis_matrix(theta, phi, harmonics.lmax_of(len(root))) @ root
         return rows @ rows.T
 
-    def to_map(self, nside: int = 64) -> Pixels:
-        """Compute the mean as a Galactic HEALPix RING map, in K."""
-        return harmonics.modes_to_map(np.asarray(self.mean), nside)
-
     def std(self) -> Float[Array, " unknowns"]:
         """Compute the standard deviation of every unknown.
 

@@ -161,8 +161,7 @@ def write_comparison(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write the page of a comparison of runs into the folder of its figures."""
     pairs = zip(comparison_rows(runs), runs, strict=True)
     rows = [row | {"ell_cross": run.cross_in_words()} for row, run in pairs]
-    more = {"rows": rows, "caveat": evidence_caveat(runs)}
-    page = render("comparison.html", folder, runs=runs, **more)
+    page = render("comparison.html", folder, runs=runs, rows=rows, caveat=evidence_caveat(runs))
     (folder / "comparison.html").write_text(page, encoding="utf-8")
 
 

@@ -56,8 +56,7 @@ def joint_prior_sentence(scenario: Scenario) -> str:
 
 def spectrum_of(channels: Sequence[ChannelResult]) -> SkySpectrum:
     """Temperatures of regions of the sky in all channels."""
-    each = [(one.frequency_mhz, one.temperatures, one.departure) for one in channels]
-    return SkySpectrum.of(*zip(*each, strict=True))
+    return SkySpectrum.of([(c.frequency_mhz, c.temperatures, c.departure) for c in channels])
 
 
 def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:

@@ -45,13 +45,11 @@ Rows = Float[np.ndarray, "area mode"]
 WithSky = Float[np.ndarray, "mode_or_source mode"]
 Columns = Float[np.ndarray, "mode_or_source shared"]
 
-# Galactic latitudes that bound caps and plane, in degrees
-CAP, PLANE = 60.0, 10.0
 # resolution of regions
 NSIDE = 64
-OBSERVED = "observed sky"
-CAPS = f"cap b > {CAP:g}", f"cap b < -{CAP:g}"
-REGIONS = "mean sky", OBSERVED, *CAPS, f"plane |b| < {PLANE:g}"
+# by Galactic latitude in degrees
+REGIONS = "mean sky", "observed sky", "cap b > 60", "cap b < -60", "plane |b| < 10"
+OBSERVED = REGIONS[1]
 UNOBSERVED, UNMEASURED = "unobserved sky", "unmeasured structure"
 # draws of a joint posterior that the correlation of its channels is computed from
 N_DRAWS = 400
@@ -71,9 +69,9 @@ def sky_regions(highest_altitude: Pixels) -> dict[str, Bool[np.ndarray, " fine"]
     """
     nside = max(NSIDE, healpy.npix2nside(len(highest_altitude)))
     _, latitude = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
-    whole, observed = np.full(len(latitude), True), healpy.ud_grade(highest_altitude, nside) >= 0.0
-    caps, plane = (latitude > CAP, latitude < -CAP), np.abs(latitude) < PLANE
-    return dict(zip(REGIONS, (whole, observed, *caps, plane), strict=True))
+    observed = healpy.ud_grade(highest_altitude, nside) >= 0.0
+    parts = latitude > 60.0, latitude < -60.0, np.abs(latitude) < 10.0
+    return dict(zip(REGIONS, (np.full(len(latitude), True), observed, *parts), strict=True))
 
 
 @dataclass(frozen=True)
@@ -184,8 +182,7 @@ class RegionTemperatures:
         inside, lmax = np.stack([*regions.values()]), lmax_of(n)
         rows, never = averaging_rows(inside, lmax), inside & ~regions[OBSERVED]
         hidden = (never.sum(1) / inside.sum(1))[:, None] * averaging_rows(never, lmax)
-        if fluxes is None:
-            fluxes = Fluxes((), *[np.zeros(0)] * 3, np.zeros((0, n)), np.zeros((n, 0)))
+        fluxes = fluxes or Fluxes((), *[np.zeros(0)] * 3, np.zeros((0, n)), np.zeros((n, 0)))
 
         def variance(rows: Rows) -> Float[np.ndarray, " area"]:
             return np.einsum("rm,rm->r", rows @ covariance, rows)
@@ -243,13 +240,9 @@ class SkySpectrum:
     )
 
     @classmethod
-    def of(
-        cls,
-        frequencies_mhz: Sequence[float],
-        channels: Sequence[RegionTemperatures],
-        departures: Sequence[Departure | None],
-    ) -> SkySpectrum:
-        """Combine the temperatures of all channels; without departures in a joint posterior."""
+    def of(cls, each: Sequence[tuple[float, RegionTemperatures, Departure | None]]) -> SkySpectrum:
+        """Combine frequencies in MHz, temperatures and departures; None in a joint posterior."""
+        frequencies_mhz, channels, departures = zip(*each, strict=True)
         first = channels[0]
         std, common = np.stack([c.std for c in channels]), np.stack([c.common for c in channels])
         if len(first.draws):

@@ -149,9 +149,7 @@ MAP = RunKind(
         Output(_write_coefficients, wanted=lambda result: result.single),
         Output.ecsv("power_spectra.ecsv", lambda result: result.spectra()),
         Output(_write_spectrum, wanted=lambda result: not result.single),
-        Output(
-            finished_runs.write_index_maps, wanted=lambda result: result.index_maps() is not None
-        ),
+        Output(finished_runs.write_index_maps, wanted=lambda r: r.index_maps() is not None),
         Output.table("sources.csv", lambda result: result.table("fluxes")),
         Output.table("pointing.csv", lambda result: result.table("pointing", "offsets")),
         Output.table("pointing_by_day.csv", lambda result: result.table("pointing", "preferred")),

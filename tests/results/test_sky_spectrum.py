@@ -181,9 +181,10 @@ def test_skies_that_are_alike_have_errors_that_are_alike():
     errors = np.cov(((means - u) @ row).T)
     given, none = (("sky",), ()), np.zeros((1, 0))
     std, zero = np.sqrt([row**2 @ c]), np.zeros(1)
-    channels = [RegionTemperatures(*given, zero, std, None, none, none.T, none.T, None)] * 2
+    channel = RegionTemperatures(*given, zero, std, None, none, none.T, none.T, None)
     departures = [Departure(mean, (row * c)[None]) for mean in means[0]]
-    covariance = SkySpectrum.of([10.0, 11.0], channels, departures).covariance[0]
+    each = [(mhz, channel, one) for mhz, one in zip([10.0, 11.0], departures, strict=True)]
+    covariance = SkySpectrum.of(each).covariance[0]
     # 1 / sqrt(4000) of the draws, 1 / sqrt(150) of the measured correlation; three of each
     np.testing.assert_allclose(np.diag(covariance), np.diag(errors), rtol=0.07)
     assert covariance[0, 1] == pytest.approx(errors[0, 1], rel=0.15)
