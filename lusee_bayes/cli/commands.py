@@ -473,7 +473,8 @@ def spectrum_command(
     run
         Result folder of map.
     region
-        mean sky, observed sky, ``cap b > 60``, ``cap b < -60`` or ``plane |b| < 10``.
+        mean sky, observed sky, ``cap b > 60``, ``cap b < -60``, ``plane |b| < 10``, or a point
+        source of the scenario.
     signal
         trough:MHZ:WIDTH (a Gaussian absorption), excess (index -2.6), constant, or a CSV file with
         frequency_mhz and temperature_k; may be repeated.

@@ -232,16 +232,16 @@ def blind_spots(
 
 def about_sky_above(setup: Setup) -> str:
     """Effect of the sky above lmax on the data, and the lmax that suffices; empty if negligible."""
-    above, section = setup.above, setup.scenario.noise.above_lmax
+    above, section, n_data = setup.above, setup.scenario.noise.above_lmax, setup.layout.size
     if above is None or section.treatment == "ignored":
         return ""
-    if (added := float(np.sqrt(above.power.sum() / len(above.root)))) < LITTLE:
+    if (added := float(np.sqrt(above.power.sum() / n_data))) < LITTLE:
         return ""
     lmax, above_ell = setup.scenario.lmax, np.append(np.cumsum(above.power[::-1])[::-1], 0.0)
-    enough = lmax + int(np.argmax(above_ell < np.sqrt(2.0 * len(above.root))))
+    enough = lmax + int(np.argmax(above_ell < np.sqrt(2.0 * n_data)))
     return (
         f"The sky above lmax = {lmax} adds about {added:.2g} standard deviations of the noise to "
-        "every datum (rms). It is marginalised: the error bars are valid, but larger. Above lmax = "
+        "every datum (rms). It is marginalised, which makes error bars larger. Above lmax = "
         f"{enough} it would add less to chi2 than chance."
     )
 

@@ -18,7 +18,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import lmax_of, synthesis_matrix
 from lusee_bayes.experiment import diagnosis
 from lusee_bayes.experiment.experiment import doubts, under_sky
-from lusee_bayes.experiment.model import radiometer, set_up, simulate
+from lusee_bayes.experiment.model import radiometer, set_up, simulate, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.instrument.products import to_matrix, to_real
@@ -166,6 +166,34 @@ def test_errors_with_every_default_for_measured_data_cover(test_data):
     assert excess.max() < 4.0
     for these in (share < 0.1, share > 0.1):
         assert 0.2 < np.mean(pulls[these] ** 2) < 1.3
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
+def test_antennas_are_found_below_a_sky_that_goes_far_above_lmax(seed):
+    """What is above lmax is hundreds of times the noise, and seen by antennas with other values;
+    with those of the expected ones chi^2 is 600 times too large."""
+    runs = "observation.runs=[{cycles: 0.6, turntable_deg: 18}, {cycles: 0.7, turntable_deg: -80}]"
+    sizes = "lmax=8", runs, "observation.step_s=43200", "sky.sources=false"
+    beam = "noise.beam={parameters: {surface_permittivity: 0.185, loss_tangent: 0.003}}"
+    above = "noise.above_lmax={least_lmax: 31}", "noise.radiometer.temperature=measured"
+    given = *sizes, beam, *above, "prior.model=local_scales", f"seed={seed}"
+    setup = set_up(lb.load_scenario("fiducial", given))
+    experiment = under_sky(setup, GalaxySection(seed=seed + 40, sources=False), seed)
+    assert np.sqrt(experiment.setup.above.power.sum() / setup.layout.size) > 50.0
+    found = lb.infer(experiment)
+    assert found.fits and found.rounds < 15
+    (beams,) = found.moving
+    values = beams.systematic.in_units(beams.expected + found.amplitudes(beams).mean)
+    std, truth = beams.systematic.stds * found.amplitudes(beams).std, true_values(experiment.setup)
+    off = [(values[name] - truth[name]) / one for name, one in zip(values, std, strict=True)]
+    assert np.abs(off).max() < 4.0
+    posterior, left = found.posterior, np.asarray(experiment.data.truth - found.posterior.mean)
+    share, directions = linalg.eigh(posterior.covariance(), posterior.prior.covariance())
+    pulls = directions.T @ left / np.sqrt(share)
+    # errors are right to a factor of 1.5; such a sky, of which nearly all is above lmax, is not
+    # Gaussian
+    assert 1.5**-2 < np.mean(pulls[share < 0.1] ** 2) < 1.5**2
 
 
 @pytest.mark.essential
