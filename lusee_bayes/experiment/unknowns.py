@@ -10,10 +10,10 @@ posterior of m.
 
 For clock and pointing, reports list the offsets of the model and those that each day prefers.
 
-Let theta be all unknowns of the instrument, W = Cov(m, theta) and V = Cov(theta). Fixing theta at
-its posterior mean lowers the covariance C of the sky by W V^-1 W^T. The share of theta is the
-variance of this matrix over the variance of C. Shares of single systematics, from blocks of W and
-V, need not add up.
+Let theta be all unknowns of the instrument and fluxes, W = Cov(m, theta) and V = Cov(theta).
+Fixing theta at its posterior mean lowers the covariance C of the sky by W V^-1 W^T. The share of
+theta is the variance of this matrix over the variance of C. Shares of single systematics, from
+blocks of W and V, need not add up.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ ALL_TOGETHER = "all together"
 
 @dataclass(frozen=True)
 class InstrumentPosterior:
-    """Posterior of theta, the unknowns of the instrument, and its effect on the map.
+    """Posterior of theta, the unknowns of the instrument and fluxes, and its effect on the map.
 
     Attributes
     ----------
