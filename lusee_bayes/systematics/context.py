@@ -44,15 +44,15 @@ class Above:
     Attributes
     ----------
     coupling : CouplingMatrix
-        A of all modes up to the highest ell. Modes below have zeros in the arrays that follow.
+        A of all modes up to the highest ell.
     modes : (modes,) array
-        Of the modelled sky, in K.
+        Those above lmax of the modelled sky, in K.
     family : PriorFamily or None
         Priors up to the highest ell, from which data choose one; None for a given prior.
     root : (all, rank) array
-        Of the part of the covariance that the data can tell from zero, in K.
+        Of the part of their covariance that the data can tell from zero, in K; zero up to lmax.
     mean : (all,) array
-        Its mean, in K.
+        Their mean, in K; zero up to lmax.
     power : (ells,) array
         Expected contribution of each ell from lmax + 1 on to chi^2 of a model without it.
     """
