@@ -108,25 +108,25 @@ class Coupling(Described, eqx.Module):
         return DenseCoupling(self._matrix() + amplitude * direction.dense(), response=self.response)
 
     @abstractmethod
-    def _forward(self, sky: Float[Array, "unknowns *n"]) -> Float[Array, "data *n"]:
-        """A m, for vectors of checked type and shape."""
+    def _forward(self, sky: Modes) -> DataVector:
+        """A m, for a vector of checked type and shape."""
 
     @abstractmethod
     def _backward(self, data: Float[Array, "data *n"]) -> Float[Array, "unknowns *n"]:
         """A^T d, for vectors of checked type and shape."""
 
-    def __matmul__(self, sky: Float[Array, "unknowns *n"]) -> Float[Array, "data *n"]:
+    def __matmul__(self, sky: Modes) -> DataVector:
         """Compute A m: the mean data of a sky.
 
         Parameters
         ----------
-        sky : (unknowns,) or (unknowns, n) array
-            In K; for harmonics the Galactic coefficients; several skies as columns. Its values are
-            not checked: NaN gives NaN.
+        sky : (unknowns,) array
+            In K; for harmonics the Galactic coefficients. Its values are not checked: NaN gives
+            NaN.
 
         Returns
         -------
-        (data,) or (data, n) array
+        (data,) array
             Visibilities in K.
 
         Raises
@@ -135,9 +135,9 @@ class Coupling(Described, eqx.Module):
             If ``sky`` is not float64 or has another length.
         """
         require_float64("the sky", sky)
-        require_shape("the sky", sky, (self.shape[1], *sky.shape[1:2]))
+        require_shape("the sky", sky, (self.shape[1],))
         data = self._forward(sky)
-        return data if self.response is None else (data.T * self.response).T
+        return data if self.response is None else data * self.response
 
     def transpose_mv(self, data: Float[Array, "data *n"]) -> Float[Array, "unknowns *n"]:
         """Compute A^T d.
@@ -498,23 +498,22 @@ class CouplingMatrix(Coupling):
         return self.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
 
     @compiled
-    def _forward(self, sky: Float[Array, "modes *n"]) -> Float[Array, "data *n"]:
+    def _forward(self, sky: Modes) -> DataVector:
         n_products, n_functions = self.body_beams.shape[1:3]
-        pairs = _pairs(self.pointing.pole_from_galactic(sky.reshape(len(sky), -1).T), self.lmax)
-        plus, minus = pairs[:, : self.lmax + 1], pairs[:, self.lmax + 1 :]
+        pairs = _pairs(self.pointing.pole_from_galactic(sky), self.lmax)
+        plus, minus = pairs[: self.lmax + 1], pairs[self.lmax + 1 :]
         xp = namespace(self, sky)
         zero_order = np.arange(self.lmax + 1)[None] == 0
-        crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)], axis=1)
-        both, half = xp.concatenate([pairs.T, crossed.T], axis=-1), len(pairs)
+        crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
+        both = xp.stack([pairs.T, crossed.T], axis=-1)
         grids = []
         for run, part in self._parts():
             x_and_y = self.by_order[run] @ both
-            x_and_y = x_and_y.reshape(len(both), n_products, n_functions, -1)
             cosine, sine = _phases(self.pointing.azimuth[part], self.lmax)
-            over_time = xp.tensordot(cosine, x_and_y[..., :half], 1)
-            over_time = over_time + xp.tensordot(sine, x_and_y[..., half:], 1)
-            grids.append(xp.einsum("tpfn,tf->ptn", over_time, self.pointing.functions[part]))
-        return self.layout.gather(xp.concatenate(grids, axis=1)).reshape(-1, *sky.shape[1:])
+            over_time = cosine @ x_and_y[..., 0] + sine @ x_and_y[..., 1]
+            over_time = over_time.reshape(-1, n_products, n_functions)
+            grids.append((over_time * self.pointing.functions[part][:, None]).sum(-1).T)
+        return self.layout.gather(xp.concatenate(grids, axis=1))
 
     @compiled
     def _backward(self, data: Float[Array, "data *n"]) -> Float[Array, "modes *n"]:

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes
+from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.source import BeamSource, Receiver
@@ -67,8 +68,8 @@ class Above:
     @property
     def seen(self) -> tuple[Float[Array, "data rank"], DataVector]:
         """Root and mean of the contribution to the data, in K."""
-        seen = self.coupling @ np.concatenate([self.root, self.mean[:, None]], axis=1)
-        return seen[:, :-1], seen[:, -1]
+        root = in_threads(self.coupling.__matmul__, list(np.ascontiguousarray(self.root.T)))
+        return np.reshape(root, (-1, self.coupling.shape[0])).T, self.coupling @ self.mean
 
 
 @dataclass(frozen=True)
