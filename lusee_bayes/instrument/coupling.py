@@ -345,8 +345,9 @@ class CouplingMatrix(Coupling):
 
         Parameters
         ----------
-        modes : (beams, modes) array
-            Harmonic coefficients in the frame of the lander, real packed.
+        modes : (beams, modes) or (runs, beams, modes) array
+            Harmonic coefficients in the frame of the lander, real packed; one set per run if the
+            terrain does not turn with the turntable.
         pointing : Pointing
             The orientations at every sample.
         layout : DataLayout

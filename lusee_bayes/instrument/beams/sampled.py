@@ -401,7 +401,7 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
 
 
 def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
-    """Write beams to netCDF, or to FITS if the name ends in .fits; complete or not at all.
+    """Write beams to netCDF, or to FITS if the name ends in .fits or .fit; complete or not at all.
 
     Parameters
     ----------
