@@ -13,7 +13,8 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import naming, require_file
+from lusee_bayes.core.reading import naming, parse_yaml, require_file
+from lusee_bayes.core.trees import opened_tree
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight.clock import read_clock
 from lusee_bayes.flight.flags import read_lines
@@ -21,6 +22,7 @@ from lusee_bayes.flight.gain_model import GainModel, read_gain_table, synthetic_
 from lusee_bayes.flight.recipe import FlightSection, Recipe
 from lusee_bayes.flight.reduced import Reduced, read_reduced
 from lusee_bayes.flight.reduction import reduce_sessions
+from lusee_bayes.flight.session import PORTS
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
@@ -34,6 +36,13 @@ ACCEPTED = (
 )
 # images that only luseepy's waterfalls have among FITS files
 WATERFALL_IMAGES = {"combinations", "products"}
+
+# settings by which sessions are reduced, except files, which may have moved
+OF_REDUCTION = {
+    "observation": {"timestamp", "average_s"},
+    "flight": FlightSection.model_fields.keys()
+    - {"gain_table", "clock", "lines", "per_kelvin_v2_hz", "leave_out", "simulated"},
+}
 
 # relative; beams and data store impedances with 24 bits
 SAME_SCALE = 1e-5
@@ -130,8 +139,27 @@ def reduced_of(data: Data, scenario: Scenario, stages: Stages | None = None) -> 
     files = files_of(data)
     if are_sessions(data):
         return reduce_files(files, scenario, stages)
-    is_reduced = bool(files) and formats.format_of(files[0]) == formats.REDUCED
-    return read_reduced(files[0]) if is_reduced else None
+    if not files or formats.format_of(files[0]) != formats.REDUCED:
+        return None
+    _require_same_reduction(files[0], scenario)
+    return read_reduced(files[0])
+
+
+def _require_same_reduction(path: Path, scenario: Scenario) -> None:
+    """Raise InputError for settings, other than the defaults, that differ from a reduction's."""
+    with opened_tree(path, formats.REDUCED, "reduced spectra", HINT) as tree:
+        made = parse_yaml(str(tree.attrs.get("scenario", "")), f"{path}: its scenario") or {}
+    whole = scenario.model_dump(mode="json", exclude_defaults=True)
+    for section, keys in OF_REDUCTION.items():
+        given = whole.get(section) or {}
+        for key in sorted(keys & given.keys()):
+            value = given[key]
+            said = made.get(section, given).get(key, value)
+            if said != value:
+                raise InputError(
+                    f"{path} was reduced with {section}.{key}={said}, the scenario has {value}; "
+                    f"reduce the sessions again, or remove {section}.{key}"
+                )
 
 
 def read_data(data: Data, scenario: Scenario) -> Visibilities:
@@ -352,6 +380,11 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
     """
     said = None if scenario.flight is None else scenario.flight.per_kelvin_v2_hz
     source = scenario.beam.source()
+    if source.n_ports != PORTS:
+        raise InputError(
+            f"sessions have the products of {PORTS} ports, the beams {source.n_ports}; give beams "
+            "of all ports"
+        )
     circuit = source.circuit(scenario.frequency_mhz)
     if circuit is None and said is None:
         raise InputError(

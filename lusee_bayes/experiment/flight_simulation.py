@@ -262,8 +262,7 @@ def spectra_observation(scenario: Scenario, window_s: float) -> Observation:
     Raises
     ------
     InputError
-        If the Moon's axis is fixed, no sample is live for this time, or the turntable rotates:
-        sessions do not contain its angle.
+        If the Moon's axis is fixed, or no sample is live for this time.
     """
     # spectra are means, independent of the scenario's observation.window
     planned = scenario.observation.model_copy(update={"window": "mean"}).observation()
@@ -277,11 +276,6 @@ def spectra_observation(scenario: Scenario, window_s: float) -> Observation:
             "observation.schedule and observation.step_s"
         )
     observation = planned.select(long)
-    if len(set(observation.turntable_deg)) > 1:
-        raise InputError(
-            "the turntable rotates within the observation, but sessions do not contain its angle; "
-            "simulate each angle separately (observation.runs)"
-        )
     edges = np.full(observation.n_times, half)
     return replace(observation, windows=Windows.whole(-edges, edges))
 

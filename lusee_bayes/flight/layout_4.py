@@ -44,6 +44,7 @@ TELEMETRY_4 = Layout(
         "field_names": Variable(("field",), "text"),
         **dict.fromkeys(("mission_seconds", "lusee_subsecs"), Variable(("time",))),
         "values": Variable(("time", "field"), missing=True),
+        "valid": Variable(("time", "field"), "boolean", optional=True),
     },
 )
 
@@ -151,7 +152,8 @@ def _telemetry_at_rows(path: Path, file: h5py.File, clock: Clock, raw_s: Rows) -
     group = file["telemetry"]
     given = {name: array for name in group if (array := _dataset(group, name)) is not None}
     arrays = TELEMETRY_4.checked(f"{path}: telemetry", given, {}).arrays
-    names, values = arrays["field_names"].tolist(), arrays["values"]
+    names = arrays["field_names"].tolist()
+    values = np.where(arrays.get("valid", True), arrays["values"], np.nan)
     times_s = arrays["mission_seconds"] + arrays["lusee_subsecs"] / TICKS - anchor + clock.raw_s
     columns = {name: values[:, names.index(name)] for name in TELEMETRY if name in names}
     return {

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from astropy.time import Time
 from jaxtyping import Int
 from pydantic import Field
 
+from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import LARGEST, Angle, Frequency, Positive, Section, requires
@@ -25,7 +27,14 @@ from lusee_bayes.flight.session import BinOrigin, Session
 from lusee_bayes.instrument.averaging import bins_of
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import CONVENTIONS
-from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, Windows, later, utc_of
+from lusee_bayes.instrument.times import (
+    TO_MIDDLE,
+    Timestamp,
+    contiguous,
+    later,
+    utc_of,
+    utc_times,
+)
 
 Share = Annotated[float, Field(ge=0, le=0.5)]
 Levels = Annotated[str, Field(pattern="^[LMH]{4}$")]
@@ -135,6 +144,9 @@ class FlightSection(Section):
         V^2/Hz that 1 K produces at each port, for beams not calibrated in volts.
     turntable_deg : float
         Turntable angle, from East towards North.
+    turns : dict of str to float
+        Later turntable angles in degrees, each by the UTC from which it holds, such as
+        ``{2027-02-11T04:30: 45}``.
     lines : str
         CSV table of known lines, with columns frequency_mhz and source.
     comb : {"found", "always", "never"}
@@ -162,6 +174,7 @@ class FlightSection(Section):
     convention: Literal["s_i conj(s_j)", "conj(s_i) s_j"] = "s_i conj(s_j)"
     per_kelvin_v2_hz: Positive | None = None
     turntable_deg: Angle = 0.0
+    turns: dict[str, Angle] = Field(default_factory=dict)
     lines: str | None = None
     comb: Literal["found", "always", "never"] = "found"
     false_alarm: Rare = 1e-4
@@ -182,6 +195,14 @@ class FlightSection(Section):
     def sign(self) -> int:
         """Sign that converts the spectrometer's imaginary parts to those of <s_i conj(s_j)>."""
         return int(CONVENTIONS[self.convention])
+
+    def angles_at(self, times: Time) -> Times:
+        """Return the turntable's angle at these times; InputError if ``turns`` has other keys."""
+        with naming("flight.turns"):
+            starts = [float(utc_times(start).jd[0]) for start in self.turns]
+        angles = [x for _, x in sorted(zip(starts, self.turns.values(), strict=True))]
+        number = np.searchsorted(np.sort(starts), times.jd, side="right")
+        return np.array([self.turntable_deg, *angles])[number]
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,19 +313,23 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     windows = None
     if recipe.timestamp != "instant":
         times = later(times, TO_MIDDLE[recipe.timestamp] * window)
-        windows = Windows.whole(-window / 2.0, window / 2.0, share * window)
-    # a state has one Navgf, one length and one set of gains; compared as text, like the levels
-    states = [np.column_stack([s.navgf, s.navg_shift, s.level]) for s in ordered]
-    changes = [np.append(True, (one[1:] != one[:-1]).any(axis=1)) for one in states]
-    state = np.cumsum(np.concatenate(changes)) - 1
+        # a spectrum of no frames has no data, whatever its live time
+        live_s = np.where(share > 0.0, share, 1.0) * window
+        windows = contiguous(times, window / 2.0, float(window.min()), live_s)
+    # a state has one Navgf, length, angle and set of gains; compared as text, like the levels
+    session = np.repeat(np.arange(len(ordered)), [s.n_rows for s in ordered])
+    settings = [np.column_stack([s.navgf, s.navg_shift, s.level]) for s in ordered]
+    angle = recipe.section.angles_at(times)
+    states = np.column_stack([session, angle, np.concatenate(settings)])
+    changes = np.append(True, (states[1:] != states[:-1]).any(axis=1))
+    state = np.cumsum(changes) - 1
     with naming(", ".join(str(s.path) for s in ordered)):
-        angles = (recipe.section.turntable_deg,) * (int(state[-1]) + 1)
+        angles = tuple(angle[changes].tolist())
         longest = float(window.max())
         observation = Observation(lon, lat, times, state, angles, longest, windows=windows)
     bin_of = np.arange(len(state))
     if recipe.average_s is not None:
         bin_of = bins_of(observation, recipe.average_s)
-    session = np.repeat(np.arange(len(ordered)), [s.n_rows for s in ordered])
     row = np.concatenate([np.arange(s.n_rows) for s in ordered])
     return Timeline(ordered, observation, session, row, bin_of)
 

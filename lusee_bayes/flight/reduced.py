@@ -20,7 +20,7 @@ from lusee_bayes.flight.gain_model import COUNTS, LEAD, LETTERS, PLACES, Curves
 from lusee_bayes.flight.session import FIRST_PORT, NO_LEVEL, PORTS, SECOND_PORT
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.fields import place_of
-from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.observation import Observation, runs_of
 from lusee_bayes.instrument.products import DataLayout, labels
 from lusee_bayes.instrument.times import Windows, utc_of
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
@@ -289,8 +289,9 @@ class Reduced(Described):
         scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
         layout = DataLayout.from_flags(~present[:, bins])
-        # one run, whatever the gains: the turntable stands still
-        run, angles = np.zeros(observation.n_times, dtype=int), observation.turntable_deg[:1]
+        # whatever the gains, a run lasts while the turntable stands still
+        angle = np.array(observation.turntable_deg)[observation.run]
+        run, angles = runs_of(angle, observation.n_times)
         observation = replace(observation, run=run, turntable_deg=angles)
         mhz = float(self.frequencies_mhz[band])
         stds = {n: x for place in PLACES for n, x in self._errors(band, bins, place) if x.any()}

@@ -185,7 +185,9 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
     rows_read = slice(first, first + len(counts))
     navgf, levels = int(source.navgf[first]), tuple(map(str, source.level[first]))
     averaging, (bands, gains, lines) = session.AVERAGING[navgf], _prepared(recipe, navgf, levels)
-    frames, saturated = source.frames[rows_read], source.saturated[rows_read]
+    share, saturated = source.share[rows_read], source.saturated[rows_read]
+    # a spectrum of no frames has no finite values
+    frames = np.maximum(source.frames[rows_read], 1.0)
     comb = source.notched[rows_read]
     if recipe.section.comb == "found":
         autos = counts[:, : session.PORTS].astype(np.float64)
@@ -208,10 +210,11 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
         at = slice(band.first, band.last)
         basis = gains[:, :, at]
         gain = np.einsum("rpc,pck->rpk", strengths, basis)
-        with np.errstate(invalid="ignore"):
-            root = np.sqrt(np.where(gain > 0.0, gain, np.nan))
-        raw = counts[:, session.OF_FLIGHT, at].astype(np.float64)
         factor = NANO2 * averaging.stride / averaging.members
+        with np.errstate(invalid="ignore", divide="ignore"):
+            root = np.sqrt(np.where(gain > 0.0, gain, np.nan))
+            # what is sent is a sum over the accepted frames, divided by the number of all frames
+            raw = counts[:, session.OF_FLIGHT, at].astype(np.float64) / share[:, None, None]
         channels = raw * factor / (root[:, session.FIRST_PORT] * root[:, session.SECOND_PORT])
         if recipe.section.sign < 0:
             channels[:, session.IMAGINARY] *= -1.0

@@ -220,8 +220,14 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     first = np.searchsorted(bin_of_left, np.arange(len(bins)))
     layout = DataLayout.from_flags(~kept[:, bins])
     means = layout.gather(np.add.reduceat(grid, first, axis=1))
-    seen = binned(observation, used, bin_of, to_s)
-    return replace(data, data=means, layout=layout, observation=seen)
+    seen, calibration = binned(observation, used, bin_of, to_s), data.calibration
+    if calibration is not None:
+        fine = calibration.select(used)
+        n_averaged = 1.0 / np.add.reduceat(weight**2 / fine.n_averaged, first)
+        slope = fine.gain_slope
+        slope = None if slope is None else np.add.reduceat(slope * weight, first, axis=1)
+        calibration = replace(fine, n_averaged=n_averaged, gain_slope=slope)
+    return replace(data, data=means, layout=layout, observation=seen, calibration=calibration)
 
 
 def product_live_s(data: Visibilities) -> float:

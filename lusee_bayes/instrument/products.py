@@ -350,10 +350,10 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
     """Return visibilities with a value at every sample, for computing noise.
 
     The noise of a sample depends on the antenna temperatures of its ports, and in the exact form on
-    all products at its time. Missing values are interpolated linearly between the nearest samples
-    of the same product before and after (at the ends the nearest one is used). A cross that was
-    never measured is zero: its ports are assumed to be uncorrelated. The auto of a port that was
-    never used is the mean of the others, and no sample depends on it.
+    all products at its time. Missing values are interpolated linearly, in the number of the sample,
+    between the nearest samples of the same product (at the ends the nearest one is used). A cross
+    that was never measured is zero: its ports are assumed to be uncorrelated. The auto of a port
+    that was never used is the mean of the others, and no sample depends on it.
 
     Parameters
     ----------

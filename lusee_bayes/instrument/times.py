@@ -294,7 +294,7 @@ class Windows(Described):
             first = int(np.argmax(gaps < -ROUNDING_S))
             raise InputError(
                 f"the windows of samples {first} and {first + 1} ({times[first].isot[:19]}) "
-                f"overlap by {-gaps[first]:g} s; remove the overlap"
+                f"overlap by {-gaps[first]:g} s; give the length of the samples (step_s), or bounds"
             )
 
     def require_bounds(self, times: Time, bounds: Any) -> None:
@@ -400,16 +400,36 @@ def windows_of(
     else:
         step, ones = step_of(times, step_s), np.ones(len(times))
         start, end = (step * (TO_MIDDLE[timestamp] + side) * ones for side in (-0.5, 0.5))
-    # one piece each, with overlaps by rounding cut off
-    rounding = _rounding(step)
     middles, half = later(times, (start + end) / 2.0), (end - start) / 2.0
-    overlap = end[:-1] - start[1:] - np.diff(seconds_from(times[0], times))
+    return middles, step, contiguous(middles, half, step, live_s)
+
+
+def contiguous(middles: Time, half: Times, step_s: float, live_s: Live = None) -> Windows:
+    """Return windows of one piece, without the overlaps due to rounded times.
+
+    Parameters
+    ----------
+    middles : (times,) Time
+    half : (times,) array
+        Half of the length of each window, in seconds.
+    step_s : float
+        Time from sample to sample, in seconds, with which the accepted overlap grows.
+    live_s : (times,) array, optional
+        Time integrated in each sample, in seconds; by default all of it.
+
+    Raises
+    ------
+    InputError
+        As :class:`.Windows`.
+    """
+    rounding = _rounding(step_s)
+    overlap = half[:-1] + half[1:] - np.diff(seconds_from(middles[0], middles))
     cut = np.where((overlap > 0.0) & (overlap <= rounding), overlap / 2.0, 0.0)
     start, end = np.append(0.0, cut) - half, half - np.append(cut, 0.0)
     if live_s is not None:
         rounded = (live_s > end - start) & (live_s <= end - start + rounding)
         live_s = np.where(rounded, end - start, live_s)
-    return middles, step, Windows.whole(start, end, live_s)
+    return Windows.whole(start, end, live_s)
 
 
 def _bounded(times: Time, bounds: Time, step_s: float | None) -> tuple[Times, Times, float]:

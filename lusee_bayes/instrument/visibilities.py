@@ -155,6 +155,7 @@ class Calibration:
         return replace(self, n_averaged=self.n_averaged[keep], gain_slope=slope)
 
 
+CALIBRATION = "n_averaged", "gain_names", "gain_port", "gain_slope"
 LOADS, LOAD = ("load_ohm_real", "load_ohm_imag"), ("load_frequency", "port", "port_2")
 # advice if there is no file
 HINT = "make some with: lusee-bayes simulate SCENARIO"
@@ -377,6 +378,10 @@ class Visibilities(checks.Described):
             arrays["load_frequency_mhz"] = receiver.frequencies_mhz
             arrays |= dict(zip(LOADS, (ohm.real, ohm.imag), strict=True))
         said = {name: getattr(seen, name) for name in ("lon_deg", "lat_deg", "step_s")}
+        if (counts := self.calibration) is not None:
+            said["lost"] = counts.lost
+            names = CALIBRATION if counts.gain_names else CALIBRATION[:1]
+            arrays |= {name: np.asarray(getattr(counts, name)) for name in names}
         said |= {"frequency_mhz": self.frequency_mhz, "jd1.scale": "utc", "jd2.scale": "utc"}
         said["window"] = None if not self.says_window else "instant" if windows is None else "mean"
         dataset = as_dataset(formats.VISIBILITIES, LAYOUT, arrays, said)
@@ -422,6 +427,10 @@ LAYOUT = Layout(
         # the receivers' loads ZL, if known
         "load_frequency_mhz": Variable(LOAD[:1], low=0.0, grows=True, optional=True, unit="MHz"),
         **dict.fromkeys(LOADS, Variable(LOAD, optional=True, unit="Ohm")),
+        "n_averaged": Variable(("time",), low=0.0, optional=True),
+        "gain_names": Variable(("gain_error",), "text", optional=True),
+        "gain_port": Variable(("gain_error",), "integer", low=0.0, optional=True),
+        "gain_slope": Variable(("gain_error", "time"), optional=True),
     },
     {
         "frequency_mhz": Attribute(low=0.0, unit="MHz"),
@@ -430,6 +439,7 @@ LAYOUT = Layout(
         "step_s": Attribute(low=0.0),
         **JD_SCALES,
         "window": Attribute("text", choices=("mean", "instant"), optional=True),
+        "lost": Attribute(low=0.0, high=1.0, optional=True),
     },
 )
 
@@ -467,5 +477,10 @@ def read_visibilities(path: str | Path) -> Visibilities:
         runs = arrays["run"], tuple(arrays["turntable_deg"].tolist()), said["step_s"]
         seen = Observation(said["lon_deg"], said["lat_deg"], times, *runs, windows=windows)
         receiver = receiver_of(path, arrays, "load_frequency_mhz", *LOADS)
-        details = said["frequency_mhz"], arrays.get("truth"), receiver, says_window
+        calibration = None
+        if "n_averaged" in arrays:
+            names = tuple(map(str, arrays.get("gain_names", ())))
+            gains = names, arrays.get("gain_port"), arrays.get("gain_slope")
+            calibration = Calibration(arrays["n_averaged"], *gains, said.get("lost", 0.0))
+        details = said["frequency_mhz"], arrays.get("truth"), receiver, says_window, calibration
         return Visibilities(layout.gather(values), layout, seen, *details)

@@ -27,6 +27,7 @@ from lusee_bayes.flight.gain_model import write_gain_table
 from lusee_bayes.flight.reduced import Reduced, write_reduced
 from lusee_bayes.flight.session_files import write_session
 from lusee_bayes.instrument.averaging import averaged, product_live_s
+from lusee_bayes.instrument.times import later
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
 from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
@@ -256,13 +257,18 @@ def _told(
 def _to_be_mapped(made: FlightSimulation, folder: Path) -> Scenario:
     """The scenario, completed with everything that the files lack."""
     flight, observation = flight_of(made.scenario), made.scenario.observation
+    seen = made.observation
+    # windows are centred on times
+    starts = later(seen.times, seen.windows.start_s).isot[np.unique(seen.run, return_index=True)[1]]
+    angles = list(zip(starts.tolist(), seen.turntable_deg, strict=True))
     said = {
         "gain_table": flight.gain_table or str(folder / GAINS),
         # a table written by the simulation contains it
         "component_std": flight.component_std if flight.gain_table else None,
         "bin_origin": made.origin,
         "clock": str(folder / CLOCK) if made.section.clock == "unknown" else None,
-        "turntable_deg": made.observation.turntable_deg[0],
+        "turntable_deg": seen.turntable_deg[0],
+        "turns": dict(angles[1:]),
         "site": "file",
         "simulated": made.section,
     }

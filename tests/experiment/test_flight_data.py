@@ -14,7 +14,7 @@ from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.model import set_up
 from lusee_bayes.flight.gain_model import synthetic_gains
 from lusee_bayes.flight.recipe import FlightSimulatedSection
-from lusee_bayes.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
+from lusee_bayes.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED, write_reduced
 from lusee_bayes.flight.session import CHANNEL_MHZ
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.flight.synthesis import Disturbances
@@ -30,7 +30,7 @@ AUTOS = [0, 7, 12, 15]
 def simulated(folder, *more, rows=8, step_s=1800.0, average_s=None):
     """Sessions, reduced, and the table of what is in them."""
     cycles = (rows + 0.5) * step_s / (27.321661 * 86400.0)
-    size = [f"observation.step_s={step_s}", f"observation.runs=[{{cycles: {cycles}}}]"]
+    size = [f"observation.runs=[{{cycles: {cycles}}}]", f"observation.step_s={step_s}"]
     files = lb.run_simulate_flight(lb.load_scenario("fiducial", [*SMALL, *size, *more]), folder)
     assert files.n_spectra == rows
     average = f"observation.average_s={'null' if average_s is None else average_s}"
@@ -82,6 +82,38 @@ def test_times_and_windows_are_those_of_the_observation(tmp_path):
     assert np.abs((reduced.observation.times.mjd - truth["mjd_utc"]) * 86400.0).max() < 1e-4
     np.testing.assert_allclose(reduced.observation.windows.live_s, 2**20 * 40e-6, rtol=1e-12)
     assert truth["frames"] == 2**20
+
+
+def test_the_turntable_turns_within_a_session(tmp_path):
+    runs = "observation.runs=[{cycles: 0.0045}, {cycles: 0.0045, turntable_deg: 30}]"
+    reduced, truth = simulated(tmp_path, QUIET, EXACT, runs, rows=10)
+    assert relative_error(reduced, truth).max() < 1e-6
+    scenario = lb.load_scenario(str(tmp_path / "scenario.yaml"), ["observation.average_s=null"])
+    data = lb.read_data(tmp_path / "session_000.h5", scenario)
+    assert data.observation.turntable_deg == (0.0, 30.0)
+    assert data.observation.run.tolist() == 5 * [0] + 5 * [1]
+    # and the model sees the sky that the sessions hold
+    signal = set_up(scenario, data).signal
+    np.testing.assert_allclose(data.grid(), signal, atol=1e-6 * np.abs(signal).max())
+
+
+def test_reduced_spectra_are_mapped_as_they_were_reduced(tmp_path):
+    """What another scenario says of the reduction is not ignored."""
+    reduced, _ = simulated(tmp_path, QUIET, rows=4)
+    given = str(tmp_path / "scenario.yaml"), ["observation.average_s=null", "frequency_mhz=10.0"]
+    scenario = lb.load_scenario(*given)
+    path = write_reduced(tmp_path / "reduced.nc", reduced, scenario.to_yaml())
+    lb.read_data(path, scenario)
+    lb.read_data(path, lb.load_scenario("fiducial", [*SMALL, "frequency_mhz=10.0"]))
+    for key, value in (
+        ("flight.turntable_deg", "45"),
+        ("flight.bin_origin", "edge"),
+        ("flight.convention", "conj(s_i) s_j"),
+        ("observation.timestamp", "end"),
+        ("observation.average_s", "7200"),
+    ):
+        other = lb.load_scenario(given[0], [*given[1], f"{key}={value}"])
+        refuse(f"was reduced with {key}=", lb.read_data, path, other)
 
 
 @pytest.mark.long
@@ -180,7 +212,6 @@ NO_SESSIONS = [
     (["noise.radiometer.duty_cycle=0.5"], "remove duty_cycle"),
     (["flight.filter_taps=4"], "independent noise"),
     (["observation.step_s=1e-5", "observation.runs=[{cycles: 1e-10}]"], "a frame of"),
-    (["observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"], "turntable rotates"),
     (["noise.gain_table={}"], "errors of the gains; give flight.gain_std"),
     (["noise.gain_table={std: 0.01}"], "give flight.gain_std, the error of the gains"),
     (["noise.gain_table={}", "flight.gain_std=0.9", "seed=2"], "is negative"),

@@ -1,7 +1,9 @@
 """Reduced spectra against the sums written out, one spectrum after the other."""
 
+import shutil
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 from assertions import refuse
@@ -10,10 +12,13 @@ from naive_flight import FLIGHT_ORDER, naive_band
 from lusee_bayes.flight import reduced as rd
 from lusee_bayes.flight import reduction
 from lusee_bayes.flight.gain_model import read_gain_table
-from lusee_bayes.flight.recipe import FlightSection, Recipe
+from lusee_bayes.flight.recipe import FlightSection, Recipe, timeline
 from lusee_bayes.flight.reduction import reduce_sessions
 from lusee_bayes.flight.session_files import read_session
+from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.products import auto_indices, labels
+from lusee_bayes.instrument.times import seconds_from
+from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.testing import assert_refused
 
 F = (10.0, 25.0)
@@ -200,6 +205,79 @@ def test_bins_that_do_not_fit_are_taken_out(reduced):
     assert (less.reason[0][[3, 108]] == rd.NO_FIT).all()
     assert less.shares(0)[rd.REASONS[rd.NO_FIT]] > 0
     np.testing.assert_array_equal(less.values[1], reduced.values[1])
+
+
+def test_spectra_of_fewer_frames_are_as_bright(flight, table, reduced, tmp_path):
+    """The flight software sends the sum of the accepted frames over the number of all."""
+    path = shutil.copy(flight / "session_a.h5", tmp_path)
+    with h5py.File(path, "a") as file:
+        frames = 2.0 ** file["spectra/metadata/Navg2_shift"][...]
+        weight = np.rint(np.linspace(0.25, 1.0, 40) * frames).astype(int)
+        weight[5] = 0
+        share = weight / frames
+        file["spectra/data"][...] = file["spectra/data"][...] * share[:, None, None]
+        file["spectra/metadata/weight"] = weight
+    found = reduce_sessions([read_session(path)], recipe(table, timestamp="middle"))
+    kept = np.arange(40) != 5
+    for band in range(2):
+        assert found.reason[band, 5] == rd.NO_DATA
+        expected = reduced.values[band][:, :40][:, kept]
+        # counts have single precision
+        np.testing.assert_allclose(found.values[band][:, kept], expected, rtol=1e-5, atol=1e-22)
+        n = share * reduced.n_averaged[band, :40]
+        np.testing.assert_allclose(found.n_averaged[band][kept], n[kept], rtol=1e-5)
+
+
+@pytest.mark.parametrize("ticks", [4096.0, 65536.0])
+def test_spectra_without_gaps_have_windows_without_overlaps(flight, table, ticks):
+    """A spectrum is no whole number of ticks of the clock that its time is told by."""
+    (one,) = sessions(flight, "a")
+    length = float(one.window_s[0])
+    raw_s = one.raw_s[0] + length * np.arange(one.n_rows)
+    one = replace(one, raw_s=np.floor(raw_s * ticks) / ticks)
+    seen = timeline([one], recipe(table, timestamp="end")).observation
+    start, end = seen.windows.bounds_s.T
+    gaps = np.diff(seconds_from(seen.times[0], seen.times)) + start[1:] - end[:-1]
+    assert gaps.min() > -1e-6 and gaps.max() < 1.5 / ticks
+    np.testing.assert_allclose(end - start, length, atol=1.5 / ticks)
+
+
+def test_the_turntable_turns_when_the_scenario_says(flight, table, reduced):
+    """Between spectra 29 and 30, in the middle of a bin."""
+    times = reduced.observation.times
+    turned = times[29] + 0.5 * (times[30] - times[29])
+    when = turned.isot
+    turns = {"2049-01-01": 90.0, when: 30.0}
+    given = {"timestamp": "middle", "average_s": 4 * 3600.0, "turntable_deg": -5.0}
+    given = recipe(table, **given, turns=turns)
+    data = reduce_sessions(sessions(flight), given).at(25.0, np.ones(4))
+    seen = data.observation
+    assert seen.turntable_deg == (-5.0, 30.0)
+    start, end = seconds_from(turned, seen.times) + seen.windows.bounds_s.T
+    assert (end[seen.run == 0] < 0.0).all() and (start[seen.run == 1] > 0.0).all()
+    assert end[seen.run == 0].max() > -1800.0 and start[seen.run == 1].min() < 1800.0
+    refuse(
+        "flight.turns.*noon", reduce_sessions, sessions(flight), recipe(table, turns={"noon": 3})
+    )
+
+
+def test_averages_of_files_are_those_of_the_reduction(flight, table, tmp_path):
+    """The samples and the gain errors behind a time, through a file and into averages."""
+    given = {"timestamp": "middle", "gain_std": 0.02}
+    fine = reduce_sessions(sessions(flight, "b"), recipe(table, **given)).at(10.0, np.ones(4))
+    read = read_visibilities(fine.write(tmp_path / "fine.nc"))
+    assert read.calibration.gain_names == fine.calibration.gain_names
+    for name in ("n_averaged", "gain_port", "gain_slope", "lost"):
+        expected = getattr(fine.calibration, name)
+        np.testing.assert_array_equal(getattr(read.calibration, name), expected)
+    # bins of 2 h, none of which holds the change of gains after 10 h
+    coarse = averaged(read, 7200.0)
+    expected = reduce_sessions(sessions(flight, "b"), recipe(table, average_s=7200.0, **given))
+    expected = expected.at(10.0, np.ones(4))
+    np.testing.assert_allclose(coarse.data, expected.data, rtol=1e-12)
+    for name in ("n_averaged", "gain_slope"):
+        found = getattr(coarse.calibration, name)
+        np.testing.assert_allclose(found, getattr(expected.calibration, name), rtol=1e-12)
 
 
 def test_what_contradicts_itself_is_refused(flight, table):

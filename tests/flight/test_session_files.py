@@ -125,6 +125,15 @@ def test_what_a_session_of_layout_4_says(newer):
         np.testing.assert_array_equal(read(1, 4), layout_4.counts()[1:4])
 
 
+def test_telemetry_that_is_marked_as_invalid_is_not_used(newer):
+    with h5py.File(newer, "a") as file:
+        k = NAMES.index("THERM_FPGA")
+        file["telemetry/values"][5:9, k] = -999.0
+        file["telemetry/valid"][5:9, k] = False
+    found = read_session(newer).telemetry["THERM_FPGA"]
+    np.testing.assert_allclose(found, layout_4.telemetry("THERM_FPGA", RAW_S), rtol=1e-9)
+
+
 def test_families_that_are_not_used_are_named(newer, capsys):
     def not_used():
         assert main(["info", str(newer)]) == 0

@@ -54,8 +54,8 @@ from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, t
 # functions in the directions that were sampled, and on a grid
 Sampled = Inexact[np.ndarray, "n *directions"]
 OnGrid = Inexact[np.ndarray, "n theta phi"]
-# tolerance of angles in degrees that are written with few digits
-ANGLE_TOLERANCE = 1e-6
+# tolerance of angles in degrees that are written with few digits, or in single precision
+ANGLE_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
