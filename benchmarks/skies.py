@@ -30,11 +30,11 @@ from rich.table import Table
 from scipy.linalg import eigh
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
+from lusee_bayes.core.harmonics import lmax_of, modes_to_map, power_spectrum
 from lusee_bayes.experiment.experiment import posterior_draws, under_sky
 from lusee_bayes.experiment.model import set_up
 from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
-from lusee_bayes.judge.coverage import LEVELS, Counts
+from lusee_bayes.judge.coverage import LEVELS, Counts, multipoles
 from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar, mollweide
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import Conditioned, conditioned
@@ -115,7 +115,9 @@ def judged(name: str, made: Conditioned, n_draws: int) -> Mapped:
     drawn = posterior_draws(made.experiment, made.posterior, lambda: made.information, n_draws)
     deviations = drawn - channel.mean
     pixels = Counts.of_pixels(channel.pixel_std, error, deviations)
-    modes = Counts.of_modes(channel.std, error, deviations)
+    # exactly known modes have a pull of zero
+    pulls = np.stack([error, *deviations]) / np.where(channel.std > 0, channel.std, np.inf)
+    modes = Counts.of(multipoles(lmax_of(len(error))), [pulls])
     left, directions = eigh(made.covariance, made.posterior.prior.covariance())
     chi2 = (directions.T @ error) ** 2 / left
     ratios = tuple(float(chi2[left < share].mean()) for share in SUBSPACES)

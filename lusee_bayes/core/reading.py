@@ -10,7 +10,7 @@ import os
 import stat
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from io import StringIO
@@ -224,14 +224,6 @@ def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:
         major, _ = np.lib.format.read_magic(file)
         header = getattr(np.lib.format, f"read_array_header_{major}_0")(file)
     return Unloaded(header[0], header[2], partial(arrays.__getitem__, name))
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write rows, with the keys of the first row as the header."""
-    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 class _Constructor(SafeConstructor):

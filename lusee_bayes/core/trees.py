@@ -302,7 +302,7 @@ def _kind_of(hint: Any, checks: Mapping[str, Any] = ANY) -> _Kind:
         return _Kind("array", dtype, declared=Variable(tuple(dims), KINDS[dtype.kind], **checks))
     if get_origin(hint) is tuple and is_dataclass(arguments[0]):
         kinds = _fields(arguments[0]).values()
-        if all(k.what == "number" or (k.what == "text" and not k.optional) for k in kinds):
+        if all(k.what in ("number", "text") and not k.optional for k in kinds):
             return _Kind("table", arguments[0])
     if is_dataclass(hint) and any(k.what not in ATTRIBUTES for k in _fields(hint).values()):
         return _Kind("group", hint)
@@ -316,10 +316,10 @@ def _kind_of(hint: Any, checks: Mapping[str, Any] = ANY) -> _Kind:
 
 
 def _table(name: str, columns: Mapping[str, list]) -> xarray.DataTree:
-    """Store columns as variables; a column of numbers may have gaps."""
+    """Store columns as variables."""
     arrays = {}
     for key, values in columns.items():
-        array = np.array([np.nan if value is None else value for value in values])
+        array = np.array(values)
         arrays[key] = (f"{name}_row", array.astype(np.int8) if array.dtype == bool else array)
     rows = {} if not columns or not len(next(iter(columns.values()))) else arrays
     return xarray.DataTree(xarray.Dataset(rows, attrs={"columns": json.dumps(list(columns))}))
@@ -346,15 +346,10 @@ def _rows(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> Iter
     if not tree.variables:
         return
     kinds = _fields(kind)
-    columns = {}
-    for name, one in kinds.items():
-        # gaps are NaN, which turns integers into real numbers
-        as_real = {"kind": "real"} if one.optional else {}
-        columns[name] = replace(one.declared, dims=("row",), optional=False, **as_real)
+    columns = {name: replace(one.declared, dims=("row",)) for name, one in kinds.items()}
     arrays = Layout(kind.__name__, columns).checked(where, tree.variables, {}).arrays
     for row in zip(*(arrays[name].tolist() for name in kinds), strict=True):
-        values = zip(kinds.items(), row, strict=True)
-        yield kind(**{n: None if k.optional and x != x else k.of(x) for (n, k), x in values})
+        yield kind(*(one.of(x) for one, x in zip(kinds.values(), row, strict=True)))
 
 
 def _dtype(names: Any) -> np.dtype:

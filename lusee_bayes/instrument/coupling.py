@@ -82,31 +82,6 @@ class Coupling(Described, eqx.Module):
     def _matrix(self) -> Matrix:
         """A as a matrix, without the response (as in all methods below)."""
 
-    def plus(self, amplitude: Float[Array, ""], direction: Coupling) -> Coupling:
-        """Add a multiple of another coupling matrix: R (A + amplitude dA), with the response R.
-
-        Parameters
-        ----------
-        amplitude : () array
-            The factor of dA.
-        direction : Coupling
-            dA, for the same data and unknowns, without a response.
-
-        Returns
-        -------
-        Coupling
-            The sum, of the same kind as ``self`` if both are of one kind.
-
-        Raises
-        ------
-        InputError
-            If ``direction`` has a response, or other data or unknowns.
-        """
-        require_shape("the direction", direction, self.shape)
-        if direction.response is not None:
-            raise InputError("the direction must be a matrix without a separate response")
-        return DenseCoupling(self._matrix() + amplitude * direction.dense(), response=self.response)
-
     @abstractmethod
     def _forward(self, sky: Modes) -> DataVector:
         """A m, for a vector of checked type and shape."""
@@ -396,15 +371,6 @@ class CouplingMatrix(Coupling):
     @property
     def has_time_structure(self) -> bool:
         return self.response is None
-
-    def plus(self, amplitude, direction):
-        if not isinstance(direction, CouplingMatrix) or direction.response is not None:
-            return super().plus(amplitude, direction)
-        self.layout.require_same(direction.layout)
-        body = self.body_beams + amplitude * direction.body_beams
-        by_order = self.by_order + amplitude * direction.by_order
-        modes = self.modes + amplitude * direction.modes
-        return replace(self, body_beams=body, by_order=by_order, modes=modes)
 
     def along(
         self, beams: Iterable[BeamModes], pointing: Pointing | None = None

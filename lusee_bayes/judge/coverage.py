@@ -15,14 +15,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lusee_bayes.core.arrays import Draws, Modes, Pixels
-from lusee_bayes.core.harmonics import lmax_of, mode_numbers, modes_to_map
+from lusee_bayes.core.harmonics import mode_numbers, modes_to_map
 from lusee_bayes.core.lazy import healpy, special
 
 # absolute or signed pulls of several skies
 Pulls = Float[np.ndarray, "skies n"]
-# probabilities of the central intervals, and the other numbers of a part
+# probabilities of the central intervals
 LEVELS = (0.50, 0.68, 0.90, 0.95)
-REST = ("rms", "rms_scatter", "largest", "allowed")
 # skies whose pulls are counted at once
 AT_ONCE = 16
 # draws that determine the scatter, to 4 %
@@ -65,12 +64,6 @@ class Coverage:
     largest: float
     allowed: float
 
-    def row(self) -> dict[str, float]:
-        """Its numbers by name, for CSV."""
-        names = [f"{kind}_{100 * level:.0f}" for kind in ("held", "scatter") for level in LEVELS]
-        shares = dict(zip(names, (*self.held, *self.scatter), strict=True))
-        return shares | {name: getattr(self, name) for name in REST}
-
 
 @dataclass(frozen=True)
 class Counts:
@@ -107,16 +100,11 @@ class Counts:
         nside = healpy.npix2nside(len(std))
         skies = np.stack([error, *deviations])
         blocks = np.array_split(skies, -(-len(skies) // AT_ONCE))
-        return cls._of(latitudes(nside), (modes_to_map(some, nside) / std for some in blocks))
+        return cls.of(latitudes(nside), (modes_to_map(some, nside) / std for some in blocks))
 
     @classmethod
-    def of_modes(cls, std: Modes, error: Modes, deviations: Draws) -> Counts:
-        """Count harmonic coefficients by multipole; exactly known ones have a pull of zero."""
-        width = np.where(std > 0, std, np.inf)
-        return cls._of(multipoles(lmax_of(len(std))), [np.stack([error, *deviations]) / width])
-
-    @classmethod
-    def _of(cls, parts: Mapping[str, np.ndarray], pulls: Iterable[Pulls]) -> Counts:
+    def of(cls, parts: Mapping[str, np.ndarray], pulls: Iterable[Pulls]) -> Counts:
+        """Count the pulls of the truth and of draws, a few skies at a time, in each part."""
         inside = np.stack(list(parts.values()), axis=1)
         counted = np.concatenate([_statistics(np.abs(some), inside) for some in pulls], axis=2)
         return cls(tuple(parts), tuple(inside.sum(axis=0).tolist()), counted)

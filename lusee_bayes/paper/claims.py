@@ -6,7 +6,7 @@ by the two conditions given to :func:`grade`. All numbers are computed here from
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -248,22 +248,11 @@ def _unobserved_cap(cases: Cases) -> Verdict:
     return grade(text, abs(radius - 24) < 1.5 and away < 3, abs(radius - 24) < 1.5)
 
 
-def _rho_large_scales(cases: Cases) -> Verdict:
-    first = [first_below(case["rho"].values, 0.9) for case in bands(cases)]
-    text = f"first ell below 0.9: {span(first)} at 5 to 50 MHz"
-    return grade(text, min(first) >= 10, min(first) >= 7)
-
-
-def _rho_small_scales(cases: Cases) -> Verdict:
-    first = [first_below(case["rho"].values, 0.5) for case in bands(cases)]
-    text = f"first ell below 0.5: {span(first)} at 5 to 50 MHz"
-    return grade(text, min(first) >= 20, middle(np.array(first)) >= 20)
-
-
-def _snr_above_one(cases: Cases) -> Verdict:
-    first = [cross(case) for case in bands(cases)]
-    text = f"first ell below 1: {span(first)}, median {middle(np.array(first)):g}"
-    return grade(text, min(first) >= 18, middle(np.array(first)) >= 18)
+def _first_below(cases: Cases, column: str, level: float, least: int) -> Verdict:
+    first = [first_below(case[column].values, level) for case in bands(cases)]
+    median = middle(np.array(first))
+    text = f"first ell below {level:g}: {span(first)}, median {median:g}, at 5 to 50 MHz"
+    return grade(text, min(first) >= least, median >= least)
 
 
 def _suppression(cases: Cases) -> Verdict:
@@ -415,16 +404,3 @@ def claim_table(cases: Cases) -> list[dict[str, object]]:
         said = {"section": claim["section"], "paper": claim["paper"]}
         rows.append(said | verdict | {"reason": reason})
     return rows
-
-
-def claims_as_markdown(rows: Sequence[Mapping[str, object]]) -> str:
-    """The claims as a table, after a count of the verdicts."""
-    verdicts = [row["agrees"] for row in rows]
-    counts = ", ".join(f"{verdicts.count(v)} {v}" for v in ("yes", "partly", "no"))
-    head = "| section | claim | obtained | agrees | if not, why |\n" + "| --- " * 5 + "|\n"
-    lines = []
-    for row in rows:
-        cells = [str(value).replace("|", "\\|") for value in row.values()]
-        cells[-1] = "" if row["agrees"] == "yes" else cells[-1]
-        lines.append(f"| {' | '.join(cells)} |\n")
-    return f"{len(rows)} claims: {counts}.\n\n{head}{''.join(lines)}"

@@ -20,7 +20,7 @@ from pandas import DataFrame
 from pydantic import BaseModel
 from xarray import Dataset, DataTree
 
-from lusee_bayes.core import files, reading
+from lusee_bayes.core import files
 from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.formats import write_netcdf
@@ -177,7 +177,7 @@ class Output:
     @classmethod
     def rows(cls, name: str, rows: Callable[[Any], Sequence[Mapping[str, object]]]) -> Output:
         """A table, row by row."""
-        return cls(lambda run, folder: reading.write_csv(folder / name, rows(run)))
+        return cls.table(name, lambda run: DataFrame(rows(run), dtype=object))
 
     @classmethod
     def ecsv(cls, name: str, table: Callable[[Any], Table]) -> Output:
@@ -188,8 +188,10 @@ class Output:
     @classmethod
     def table(cls, name: str, table: Callable[[Any], DataFrame | None]) -> Output:
         """A pandas table; None if the run has none."""
+        # names of files may contain invalid bytes
+        given = {"index": False, "errors": "backslashreplace"}
         return cls(
-            lambda run, folder: table(run).to_csv(folder / name, index=False),
+            lambda run, folder: table(run).to_csv(folder / name, **given),
             lambda run: table(run) is not None,
         )
 

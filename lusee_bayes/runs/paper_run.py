@@ -12,8 +12,9 @@ from lusee_bayes.core.files import replacing
 from lusee_bayes.core.formats import write_netcdf
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios
-from lusee_bayes.paper.claims import Cases, claim_table, claims_as_markdown
+from lusee_bayes.paper.claims import Cases, claim_table
 from lusee_bayes.paper.figures import FIGURES
+from lusee_bayes.report.rendering import render_text
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
@@ -85,7 +86,7 @@ PAPER = RunKind(
         Output(_write_cases),
         Output.rows("cases.csv", case_table),
         Output.rows("claims.csv", lambda cases: claim_table(cases)),
-        Output.text("claims.md", lambda cases: claims_as_markdown(claim_table(cases))),
+        Output.text("claims.md", lambda cases: render_text("claims.md", rows=claim_table(cases))),
     ),
     figures=FIGURES,
     unfinished=UNFINISHED,

@@ -18,7 +18,7 @@ from pydantic import Field
 from lusee_bayes.core.arrays import DataVector
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.coupling import BeamModes, Coupling, CouplingMatrix, Instrument
+from lusee_bayes.instrument.coupling import BeamModes, CouplingMatrix, Instrument
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import instrument_errors
 from lusee_bayes.systematics.context import Around, Setup
@@ -89,8 +89,7 @@ class BeamErrors(Systematic):
             For unknown names, and for a prior that exceeds a parameter's domain.
         """
         if not section.parameters:
-            direction = difference_of_beams(section, setup)
-            return BeamError(CouplingMatrix.of_modes(direction, setup.pointing, setup.layout))
+            return BeamError(difference_of_beams(section, setup))
         unknowns = []
         for name, std in section.parameters.items():
             p = setup.instrument.source.parameter(name)
@@ -151,27 +150,28 @@ def difference_of_beams(section: BeamErrorSection, setup: Setup) -> BeamModes:
 
 
 class BeamError(BeamErrors):
-    """Beams that deviate along one direction dA by an unknown amplitude, N(0, 1).
+    """Beams that deviate along one direction by an unknown amplitude, N(0, 1).
 
     Attributes
     ----------
-    direction : Coupling
-        dA for an amplitude of one, such as the difference to another beam.
+    direction : (products, modes) or (runs, products, modes) array
+        The deviation for an amplitude of one, such as the difference to another beam.
     """
 
     unknowns: ClassVar[tuple[Unknown, ...]] = (Unknown("beam_amplitude"),)
     first_order: ClassVar[bool] = False
 
-    direction: Coupling
+    direction: BeamModes
 
     def effect(self, model, values):
-        """Use A + amplitude dA."""
-        amplitude = values["beam_amplitude"]
-        return replace(model, coupling=model.coupling.plus(amplitude, self.direction))
+        """Use A of these beams."""
+        modes = model.coupling.modes + values["beam_amplitude"] * self.direction
+        return replace(model, coupling=model.coupling.of(modes=modes))
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add dA (S + mu mu^T) dA^T to N."""
-        noise = instrument_errors.beam_error_noise(self.direction, model.prior)
+        direction = replace(model.coupling.of(modes=self.direction), response=None)
+        noise = instrument_errors.beam_error_noise(direction, model.prior)
         return replace(model, noise=model.noise + noise)
 
 

@@ -22,7 +22,7 @@ from lusee_bayes.core.harmonics import n_modes, turn_about_z
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
+from lusee_bayes.instrument.coupling import Coupling
 from lusee_bayes.instrument.products import auto_indices, labels, to_matrix, to_real
 from lusee_bayes.linear.normal_matrix import normal_matrix
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance
@@ -249,7 +249,7 @@ def check_beam_source(
 
 
 @eqx.filter_jit
-def _numbers_of_coupling(coupling: Coupling, matrix: DenseCoupling, m, d, skies, responses, half):
+def _numbers_of_coupling(coupling: Coupling, m, d, skies, responses):
     """Numbers that the contract compares inside transformations, in one program."""
     first, second = responses
     changed = coupling.with_response(first).with_response(second)
@@ -261,10 +261,6 @@ def _numbers_of_coupling(coupling: Coupling, matrix: DenseCoupling, m, d, skies,
         "changed_mv": changed @ m,
         "changed_transpose_mv": changed.transpose_mv(d),
         "slope_of_response": jax.grad(lambda r: d @ (coupling.with_response(r) @ m))(first),
-        "plus": coupling.plus(half, coupling).dense(),
-        "changed_plus": changed.plus(half, coupling).dense(),
-        "plus_dense": changed.plus(half, matrix) @ m,
-        "slope_of_plus": jax.grad(lambda x: d @ (coupling.plus(x, coupling) @ m))(half),
     }
 
 
@@ -297,9 +293,8 @@ def check_coupling(coupling: Coupling, dense: Float[np.ndarray, "data unknowns"]
     same(coupling.transpose_mv(d), dense.T @ data)
     assert np.isnan(coupling @ m.at[0].set(jnp.nan)).any()
     skies, responses = rng.standard_normal((3, n_unknowns)), rng.uniform(0.5, 2.0, (2, n_data))
-    half, matrix = jnp.asarray(0.5), DenseCoupling(jnp.asarray(dense))
-    arguments = (m, d, jnp.asarray(skies), jnp.asarray(responses), half)
-    got = _numbers_of_coupling(coupling, matrix, *arguments)
+    arguments = (m, d, jnp.asarray(skies), jnp.asarray(responses))
+    got = _numbers_of_coupling(coupling, *arguments)
     same(got["jitted"], dense @ sky)
     same(got["mapped"], skies @ dense.T)
     same(got["slope"], dense.T @ data)
@@ -314,13 +309,6 @@ def check_coupling(coupling: Coupling, dense: Float[np.ndarray, "data unknowns"]
     same(got["changed_mv"], rows @ sky)
     same(got["changed_transpose_mv"], rows.T @ data)
     same(got["slope_of_response"], data * (dense @ sky))
-
-    # a multiple of another matrix is added to A before the response multiplies it
-    same(got["plus"], 1.5 * dense)
-    same(got["changed_plus"], 1.5 * rows)
-    same(got["plus_dense"], 1.5 * rows @ sky)
-    same(got["slope_of_plus"], data @ (dense @ sky))
-    assert_refused(lambda: coupling.plus(half, changed))
 
     # with structure in time, the normal matrix can be summed without A
     if coupling.has_time_structure:

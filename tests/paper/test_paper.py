@@ -48,7 +48,8 @@ def four(monkeypatch):
     """A run has four cases, no figures and no claims, which are about all of them."""
     whole_paper()  # kept for all tests: of all cases
     monkeypatch.setattr(paper, "CASES", dict(list(paper.CASES.items())[:4]))
-    monkeypatch.setattr(runs, "claim_table", lambda _: [{"section": "1", "agrees": "yes"}])
+    one = dict.fromkeys(("section", "paper", "obtained", "agrees", "reason"), "yes")
+    monkeypatch.setattr(runs, "claim_table", lambda _: [one])
     monkeypatch.setattr(runs, "PAPER", replace(runs.PAPER, figures={}))
 
 

@@ -97,15 +97,6 @@ def test_every_warning_has_its_reason(change, words):
     assert all(word in found for word in words)
 
 
-TICKS = [(0.0, "0"), (12500.0, "12,500"), (0.25, "0.25"), (1.5e10, "1.5e10"), (-2e-5, "-2e-5")]
-
-
-@pytest.mark.parametrize(("value", "text"), TICKS)
-def test_ticks_are_short(value, text):
-    assert drawing.number_of_tick(value) == text
-    assert float(text.replace(",", "")) == value
-
-
 # --- templates: what is missing is an error -------------------------------------------------------
 
 

@@ -31,7 +31,7 @@ from matplotlib.image import AxesImage, imsave
 from matplotlib.patches import Circle, Ellipse
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
-from matplotlib.ticker import LogLocator, MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, StrMethodFormatter
 
 from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map, per_mode, taper
@@ -131,15 +131,7 @@ def plain_ticks(axes: Axes, n: int = 4) -> None:
     """At most ``n`` ticks on each axis, labelled with full numbers instead of an offset."""
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(n))
-        axis.set_major_formatter(lambda value, _: number_of_tick(value))
-
-
-def number_of_tick(value: float) -> str:
-    """A number in a short form: 12,500 or 1.5e10."""
-    if value == 0 or 1e-3 <= abs(value) < 1e6:
-        return f"{value:,.6g}"
-    mantissa, power = f"{value:.3e}".split("e")
-    return f"{float(mantissa):g}e{int(power)}"
+        axis.set_major_formatter(StrMethodFormatter("{x:,.6g}"))
 
 
 def side_by_side(axes: Axes, data: Float[np.ndarray, "n times"], products: Sequence[str]) -> None:
