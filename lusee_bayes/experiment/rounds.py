@@ -23,7 +23,7 @@ from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes, varia
 from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.noise.covariance import LowRankFactor
+from lusee_bayes.noise.covariance import LowRankFactor, LowRankUpdate
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, averaged_beyond, learn_whatever_fits
 from lusee_bayes.sky.prior import Prior
@@ -260,11 +260,11 @@ def settled(
             setup = replace(setup, prior=learned.prior)
         if last or at_rest:
             break
-        around, step = _around(setup, inference, step)
+        around, step, exact = _around(setup, inference, step)
         mean, n, as_learned = inference.posterior.mean, inference.rounds + 1, inference.learned
         excess = inference.excess
         del inference  # its N
-        inference = replace(_conditioned(setup, around, n, None), learned=as_learned)
+        inference = replace(_conditioned(setup, around, n, exact), learned=as_learned)
         report(inference.rounds, inference.remark)
         moves = inference.moves_from(mean) if around.tempered == 1.0 else np.inf
         hopeless = inference.moving and inference.excess > STALLED * excess and not inference.fits
@@ -306,7 +306,7 @@ def _approached(setup: Setup, around: Around, report: Report) -> tuple[Inference
     inference, step = _conditioned(setup, around, 1, None), _Step()
     moves, stalled = np.inf if rebuilds(setup) else 0.0, False
     while moves > NEARLY and not stalled and inference.rounds < MAX_TEMPERED_ROUNDS:
-        (around, step), exact = _around(setup, inference, step), None
+        around, step, exact = _around(setup, inference, step)
         mean, n, excess = inference.posterior.mean, inference.rounds + 1, inference.excess
         at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
         # at rest, a misfit that larger noise does not explain will not improve
@@ -390,8 +390,10 @@ class _Step:
         return _Step(whole, swing, size)
 
 
-def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _Step]:
-    """The next expansion point of N, given a posterior, and the step to it."""
+def _around(
+    setup: Setup, inference: Inference, step: _Step
+) -> tuple[Around, _Step, Inference | None]:
+    """The next expansion point of N, the step to it, and the sky of its instrument if computed."""
     around, solution = inference.around, inference.solution
     solved = solution.weighted_residual()
     if inference.moving:
@@ -409,8 +411,6 @@ def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _S
         ok = around.tempered == 1.0 and inference.fits
         tempered = 1.0 if ok else _tempered(around.tempered * inference.misfit(), inference.rounds)
         around = replace(around, sky=sky, values=values, tempered=tempered)
-    if around.tempered == 1.0 and inference.moving:
-        around = replace(around, volume=_volume(solution))
     if rebuilds_visibilities(setup):
         seen = prediction(moved(setup, around.values), inference, solved)
         around = replace(around, visibilities=seen)
@@ -419,9 +419,14 @@ def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _S
             gains = slope = None
             if off < SAME_VISIBILITIES:
                 gains = drifts.inferred(solved)[0]
-                slope = drifts.volume_slope(solution, around.volume or _volume(solution))
+                slope = drifts.volume_slope(solution, _volume(solution))
             around = replace(around, gains=gains, gain_slope=slope)
-    return around, step
+    exact = None
+    if around.tempered == 1.0 and inference.moving:
+        # with the unknowns at these values: the sky that they would hide scatters without bound
+        exact = _exact(setup, around)
+        around = replace(around, volume=_volume(exact.solution))
+    return around, step, exact
 
 
 def _beginning(setup: Setup, around: Around) -> Around:
@@ -459,8 +464,10 @@ def _volume(solution: Solution) -> Volume:
 
 
 def rebuilds(setup: Setup) -> bool:
-    """Whether any term of N is built around the inference."""
-    return rebuilds_visibilities(setup) or bool(first_order(setup.scenario))
+    """Whether any term of N is built around the inference, or of a prior that is learned."""
+    error = setup.scenario.noise.beam
+    of_prior = setup.family is not None and is_modelled(error) and not error.parameters
+    return rebuilds_visibilities(setup) or bool(first_order(setup.scenario)) or of_prior
 
 
 def first_order(scenario: Scenario) -> tuple[type[Systematic], ...]:
@@ -490,8 +497,12 @@ def prediction(setup: Setup, inference: Inference, solved: DataVector) -> Grid:
         N^-1 (d - A m) of the mean map.
     """
     mean = replace(setup.sky, modes=inference.posterior.mean)
-    columns = (part.columns for part in inference.expanded if not part.changes_coupling)
-    besides = sum((t @ (t.T @ solved) for t in columns), start=np.zeros(len(solved)))
+    noise, besides = inference.model.noise, np.zeros(len(solved))
+    if isinstance(noise, LowRankUpdate):
+        # without the values that are part of the setup
+        signed = [(1.0, np.asarray(noise.update.root))]
+        signed += [(-1.0, part.columns) for part in inference.expanded if part.changes_coupling]
+        besides = sum((sign * (t @ (t.T @ solved)) for sign, t in signed), start=besides)
     for drifts in inference.drifts:
         besides = besides / np.asarray(drifts.response(drifts.about))
     return setup.under(mean).signal + setup.layout.scatter(besides)
@@ -533,7 +544,7 @@ def with_learned_prior(
     def learn(information: Information, at: Vector | None) -> Learned:
         return learned_prior(setup, whole(information), first if at is None else at)
 
-    if AboveLmax.treatment(setup.scenario) == "marginalised":
+    if AboveLmax.treatment(setup.scenario) in ("marginalised", "sampled"):
         # the expected sky above lmax follows from the prior learned below
         result = settled(setup, start, report=report)
         # a survey's resolution ends somewhere: what is above it is as strong as without surveys

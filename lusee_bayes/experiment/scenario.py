@@ -237,8 +237,10 @@ class Scenario(Section):
                 "sources.list needs the exact beams of the embedded antennas; remove beam.file "
                 "and noise.beam.file, or the sources"
             )
-        if self.joint and (prior.has_files or prior.surveys):
-            raise ValueError("joint uses the spectral prior; remove files and surveys of the prior")
+        if self.joint and (prior.has_files or prior.surveys or getattr(prior, "scale", 1.0) != 1.0):
+            raise ValueError(
+                "joint uses the spectral prior; remove files, surveys and scale of the prior"
+            )
         if many and prior.has_files and prior.file_frequency_mhz is None:
             raise ValueError(
                 "the files of the prior are for one frequency; with frequencies_mhz, give it as "

@@ -344,7 +344,7 @@ class SpectralSection(Section):
         For positive skies, fit the flux of each catalogue source independently in every channel,
         with an uncertainty equal to the flux.
     index : float
-        Spectral index of the power law.
+        Spectral index of the power law, for components and kernel.
     reference_mhz : float
         Reference frequency of the components.
     turnover_mhz : float
@@ -353,7 +353,8 @@ class SpectralSection(Section):
         Correlation length of the Gaussian process in ln nu.
     residual : float
         rms of the part that is independent in each channel, relative to the rms of its sky;
-        default: the part of the skies outside the components, or 0.01 with the kernel.
+        default: the part of the skies outside the components, or 0.01 with the kernel. Positive
+        skies have none.
     """
 
     model: Literal["components", "kernel", "positive"] = "components"

@@ -40,7 +40,9 @@ class BeamErrorSection(Section):
     Attributes
     ----------
     shift_mhz : float
-        The data use the beams at frequency + shift.
+        The data use the beams at frequency + shift. Like ``file``, as an unknown this changes A of
+        the map's sky only: sources, polarisation, ground emission and the sky above lmax keep the
+        model's beams.
     file : str
         The data use the beams in this file.
     parameters : dict
@@ -89,7 +91,7 @@ class BeamErrors(Systematic):
             For unknown names, and for a prior that exceeds a parameter's domain.
         """
         if not section.parameters:
-            return BeamError(difference_of_beams(section, setup))
+            return BeamError(difference_of_beams(section, setup, around.values or {}))
         unknowns = []
         for name, std in section.parameters.items():
             p = setup.instrument.source.parameter(name)
@@ -138,15 +140,27 @@ def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[Beam
     return source.with_values(chosen), frequency_mhz
 
 
-def difference_of_beams(section: BeamErrorSection, setup: Setup) -> BeamModes:
-    """Difference to the beams of a shift or a file; one for each run if there is a horizon."""
+def difference_of_beams(section: BeamErrorSection, setup: Setup, values: Values) -> BeamModes:
+    """Difference to the beams of a shift or a file; one for each run if there is a horizon.
+
+    Parameters
+    ----------
+    section : BeamErrorSection
+    setup : Setup
+    values : mapping
+        Of the horizon's unknowns; others are at their prior means.
+    """
     source, frequency_mhz = _true(section, setup, {})
     other, horizon = source.beams(frequency_mhz, setup.beams.lmax), setup.scenario.noise.horizon
     modes = instrument_errors.difference(other, setup.instrument.beams()).modes
     if horizon is None:
         return modes
-    terrain = Horizon.build(horizon, replace(setup, beam_source=source, beams=other), Around())
-    return modes + terrain.hidden(dict.fromkeys(terrain.names, 0.0)) - setup.hidden
+    theirs, ours = (
+        Horizon.build(horizon, replace(setup, beam_source=one, beams=beams), Around())
+        for one, beams in ((source, other), (setup.beam_source, setup.beams))
+    )
+    at = {name: values.get(name, 0.0) for name in ours.names}
+    return modes + theirs.hidden(at) - ours.hidden(at)
 
 
 class BeamError(BeamErrors):
@@ -156,12 +170,18 @@ class BeamError(BeamErrors):
     ----------
     direction : (products, modes) or (runs, products, modes) array
         The deviation for an amplitude of one, such as the difference to another beam.
+    gains : (data,) array or None
+        Later gains.
     """
 
     unknowns: ClassVar[tuple[Unknown, ...]] = (Unknown("beam_amplitude"),)
     first_order: ClassVar[bool] = False
 
     direction: BeamModes
+    gains: DataVector | None = None
+
+    def behind(self, gains: DataVector) -> BeamError:
+        return replace(self, gains=np.asarray(gains))
 
     def effect(self, model, values):
         """Use A of these beams."""
@@ -170,7 +190,7 @@ class BeamError(BeamErrors):
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add dA (S + mu mu^T) dA^T to N."""
-        direction = replace(model.coupling.of(modes=self.direction), response=None)
+        direction = replace(model.coupling.of(modes=self.direction), response=self.gains)
         noise = instrument_errors.beam_error_noise(direction, model.prior)
         return replace(model, noise=model.noise + noise)
 

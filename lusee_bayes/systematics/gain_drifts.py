@@ -122,6 +122,7 @@ class GainDrifts(Systematic):
     section: ClassVar[type[Section]] = GainSection
     draw: ClassVar[int] = 2
     needs_sky: ClassVar[bool] = True
+    scales_sky: ClassVar[bool] = True
     first_order: ClassVar[bool] = False
 
     drift: GainDrift

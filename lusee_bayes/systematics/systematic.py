@@ -19,10 +19,10 @@ ln p(d | z) contains the volume -ln|Lambda| / 2 besides the misfit. The volume h
     g = -tr(C A^T N^-1 dA/dz) = -E[T(s)^T w],    s = C A^T w,    w ~ N(0, N^-1),
 
 with the columns T(s) for a sky s. A prior mean of g in place of 0 has the same slope: with it,
-rounds converge to the mode of p(z | d). Skies s are maps of noise alone: they contain the well
-determined modes, and a few of them give g to sqrt(2 n / draws) of the relative change of a datum by
-one unknown. (Draws of N(0, C) would not: if an unknown moves an undetermined mode into view of the
-data, they scatter without bound.)
+rounds converge to the mode of p(z | d). C and N are those with z known: if they contained its
+uncertainty, skies s would scatter along the directions that z hides. Skies s are maps of noise
+alone, so that a few draws suffice. (Draws of N(0, C) would not: if an unknown moves an undetermined
+mode into view of the data, they scatter without bound.)
 
 Some classes override :meth:`Systematic.marginalised`: many Gaussian unknowns have a separate
 covariance (gain drifts, :class:`AdditiveNoise`), errors of beams a covariance averaged over the

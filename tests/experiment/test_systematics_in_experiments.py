@@ -134,7 +134,7 @@ def test_a_shifted_beam_is_that_of_the_other_frequency():
     # the same beams compiled twice: rounding
     within(models.moved(setup, models.true_values(setup)).beams.modes, other.modes, 1e-15)
     change = np.asarray(other.modes) - np.asarray(setup.beams.modes)
-    within(difference_of_beams(setup.scenario.noise.beam, setup), change, 1e-15)
+    within(difference_of_beams(setup.scenario.noise.beam, setup, {}), change, 1e-15)
     seen = lb.CouplingMatrix.build(other, setup.pointing) @ setup.sky.modes
     z = np.asarray(data.data - seen) / np.sqrt(np.asarray(radiometer(setup).diagonal()))
     assert abs((z**2).sum() - z.size) < 5 * np.sqrt(2 * z.size)

@@ -230,7 +230,7 @@ def test_a_second_file_as_the_true_beams(tmp_path):
     path, other = write(tmp_path / "a.fits"), write(tmp_path / "b.fits", change=brighter)
     setup = set_up(small_scenario(f"beam.file={path}", f"noise.beam.file={other}"))
     assert beam_rms_difference(setup) == pytest.approx(1.01**2 - 1, rel=1e-9)
-    direction = difference_of_beams(setup.scenario.noise.beam, setup)
+    direction = difference_of_beams(setup.scenario.noise.beam, setup, {})
     within(direction, (1.01**2 - 1) * np.asarray(setup.beams.modes), 1e-12)
     signal = np.asarray(true_signal(setup, true_values(setup)))
     modelled = np.asarray(setup.signal)
