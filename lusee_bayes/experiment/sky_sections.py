@@ -131,9 +131,7 @@ class SurveySection(Section):
         """
         file = require_file(self.file, "survey", "check prior.surveys")
         sky, unseen = sky_source.read_sky_file(file, self.dataset), None
-        ell = np.arange(lmax + 1.0)
-        sigma = np.radians(self.beam_deg) / np.sqrt(8.0 * np.log(2.0))
-        beam = per_mode(np.exp(-0.5 * ell * (ell + 1.0) * sigma**2))
+        beam = per_mode(healpy.gauss_beam(np.radians(self.beam_deg), lmax))
         if isinstance(sky, sky_source.SkyMap):
             gaps = sky.unseen
             if self.mask_file is not None:
@@ -326,14 +324,14 @@ MOST_UNKNOWNS = 10_000
 class SpectralSection(Section):
     """The prior on skies of several frequencies that are mapped jointly.
 
-    For components and kernel, C_ell follows from the scenario's skies; for positive skies it is
-    learned from the data.
+    For components, C_ell follows from the scenario's skies; for positive skies it is learned from
+    the data.
 
     Attributes
     ----------
-    model : {"components", "kernel", "positive"}
-        A sum of maps with given spectra, a power law times a Gaussian process in ln nu, or the
-        embedded diffuse Galaxy times the exponential of fields, which is positive everywhere.
+    model : {"components", "positive"}
+        A sum of maps with given spectra, or the embedded diffuse Galaxy times the exponential of
+        fields, which is positive everywhere.
     components : tuple of str
         Spectra of the maps: a power law, its curvature (times ln nu) and its turnover (times
         1 - exp(-tau), tau = (turnover_mhz / nu)^2.1).
@@ -344,20 +342,17 @@ class SpectralSection(Section):
         For positive skies, fit the flux of each catalogue source independently in every channel,
         with an uncertainty equal to the flux.
     index : float
-        Spectral index of the power law, for components and kernel.
+        Spectral index of the components' power law.
     reference_mhz : float
         Reference frequency of the components.
     turnover_mhz : float
         Frequency at which the turnover has optical depth 1.
-    length : float
-        Correlation length of the Gaussian process in ln nu.
     residual : float
         rms of the part that is independent in each channel, relative to the rms of its sky;
-        default: the part of the skies outside the components, or 0.01 with the kernel. Positive
-        skies have none.
+        default: the part of the skies outside the components. Positive skies have none.
     """
 
-    model: Literal["components", "kernel", "positive"] = "components"
+    model: Literal["components", "positive"] = "components"
     components: Annotated[
         tuple[Literal["power_law", "curvature", "turnover"], ...], Field(min_length=1)
     ] = ("power_law", "curvature", "turnover")
@@ -368,8 +363,15 @@ class SpectralSection(Section):
     index: Annotated[float, Field(ge=-20, le=20)] = -2.5
     reference_mhz: Megahertz = 20.0
     turnover_mhz: Megahertz = 5.0
-    length: Positive = 1.0
     residual: Annotated[float, Field(ge=0, le=1)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _before_the_kernel_went(cls, tree: Any) -> Any:
+        """Scenarios of 0.1 contained its length, also where it had no effect."""
+        if isinstance(tree, dict) and tree.get("model") != "kernel":
+            return {key: value for key, value in tree.items() if (key, value) != ("length", 1.0)}
+        return tree
 
     def require_channels(self, n: int) -> None:
         """Raise InputError if there are too few channels to share a posterior."""
@@ -419,21 +421,12 @@ class SpectralSection(Section):
         skies = np.array(frequencies_mhz), templates, lmax, self.fields
         return PositiveSkies.of(*skies, sources=sources, **options)
 
-    def n_maps(self, frequencies_mhz: tuple[float, ...]) -> int:
-        """Number of maps from which the skies of these channels are composed."""
-        if self.model == "positive":
-            return len(self.fields)
-        if self.model == "components":
-            return len(self.components)
-        # number of significant principal spectra
-        frequencies = np.array(frequencies_mhz)
-        return self.prior(frequencies, np.ones((len(frequencies), 1))).n_components
+    @property
+    def n_maps(self) -> int:
+        """Number of maps from which the skies of all channels are composed."""
+        return len(self.fields if self.model == "positive" else self.components)
 
     def prior(self, frequencies_mhz: np.ndarray, skies: np.ndarray) -> SpectralPrior:
         """The prior on linear skies of all channels; ``skies`` (channels, modes) model them."""
-        used = {"index", "reference_mhz"}
-        if self.model == "components":
-            given = self.model_dump(include=used | {"turnover_mhz", "residual"})
-            return SpectralPrior.components(frequencies_mhz, skies, self.components, **given)
-        given = self.model_dump(include=used | {"length", "residual"}, exclude_none=True)
-        return SpectralPrior.kernel(frequencies_mhz, skies, **given)
+        given = self.model_dump(include={"index", "reference_mhz", "turnover_mhz", "residual"})
+        return SpectralPrior.components(frequencies_mhz, skies, self.components, **given)

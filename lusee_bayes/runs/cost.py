@@ -83,7 +83,7 @@ def demand_of(*scenarios: Scenario, n_draws: int = 0) -> Demand:
     task_bytes = max(posterior_cost(one, n_draws).memory for one in alone) - BASE_BYTES
     if scenarios[0].joint:
         # sums over channels for every pair of components, and a second set that is added to them
-        count = scenarios[0].spectral.n_maps(scenarios[0].frequencies_mhz)
+        count = scenarios[0].spectral.n_maps
         task_bytes += 16.0 * (count * (count + 1) / 2) * (scenarios[0].lmax + 1) ** 4
     return Demand(BASE_BYTES, task_bytes)
 
@@ -131,7 +131,7 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
     n_modes = (scenario.lmax + 1) ** 2
     n, rounds, squares = n_modes, 1, SQUARES
     if scenario.joint:
-        n, squares = scenario.spectral.n_maps(scenario.frequencies_mhz) * n_modes, JOINT_SQUARES
+        n, squares = scenario.spectral.n_maps * n_modes, JOINT_SQUARES
         if scenario.spectral.model == "positive":
             lmax = scenario.spectral.lmax_of_fields(scenario.lmax)
             n, rounds = len(scenario.spectral.fields) * (lmax + 1) ** 2, ROUNDS

@@ -5,7 +5,7 @@
     m_f = sum_c s_fc a_c + r_f,    a_c ~ N(0, C^c_ell),    r_f ~ N(0, R^f_ell),
 
 so S = sum_c s_c s_c^T (x) C^c + diag(R^f). The spectra are a power law, its curvature and its
-turnover, or the principal ones of a kernel in ln frequency; the residual is the remainder.
+turnover; the residual is the remainder.
 """
 
 from __future__ import annotations
@@ -29,8 +29,6 @@ SPECTRA = {
     "curvature": lambda x, y: np.log(x),
     "turnover": lambda x, y: -np.expm1(-(y**-2.1)),
 }
-# principal spectra of a kernel with a smaller share of the variance are dropped
-KERNEL_TOLERANCE = 1e-10
 
 
 def require_names(
@@ -174,57 +172,6 @@ class SpectralPrior(checks.Described, eqx.Module):
         residuals = (left_over, 1.0) if residual is None else (skies, residual)
         parts = map(jnp.asarray, (frequencies, mixing, power_spectrum(maps)))
         return cls(*parts, _residual_spectra(*residuals), names)
-
-    @classmethod
-    def kernel(
-        cls,
-        frequencies_mhz: Float[Array, " channels"],
-        skies: Float[Array, "channels modes"],
-        *,
-        length: float = 1.0,
-        index: float = -2.5,
-        reference_mhz: float = 20.0,
-        residual: float = 0.01,
-    ) -> SpectralPrior:
-        """Use the principal spectra of a kernel in ln frequency.
-
-        S = C_ell (x) K with K = (x x')^index exp(-ln^2(x / x') / 2 length^2), x = nu / reference.
-        C_ell is the mean over channels of the model skies' C_ell over the power law's square.
-        Principal spectra below ``KERNEL_TOLERANCE`` of the first are dropped.
-
-        Parameters
-        ----------
-        frequencies_mhz : (channels,) array
-            Frequencies in MHz.
-        skies : (channels, modes) array
-            Model skies, in K.
-        length : float
-            Correlation length in ln frequency.
-        index : float
-            Spectral index of the power law.
-        reference_mhz : float
-            Its reference frequency in MHz.
-        residual : float
-            Rms of each channel's residual over that of its sky; 0 is no residual.
-
-        Raises
-        ------
-        InputError
-            For a length that is not positive, and a negative residual.
-        """
-        checks.require_positive("the kernel's length in ln frequency", length)
-        frequencies, skies = np.asarray(frequencies_mhz), np.asarray(skies)
-        log_x = np.log(frequencies / reference_mhz)
-        power_law = np.exp(index * log_x)
-        correlation = np.exp(-((log_x[:, None] - log_x[None]) ** 2) / (2.0 * length**2))
-        values, vectors = np.linalg.eigh(correlation)
-        kept = values > KERNEL_TOLERANCE * values[-1]
-        values, vectors = values[kept][::-1], vectors[:, kept][:, ::-1]
-        spectrum = power_spectrum(skies / power_law[:, None]).mean(0)
-        names = tuple(f"principal {k}" for k in range(len(values)))
-        mixing, spectra = power_law[:, None] * vectors, values[:, None] * spectrum
-        parts = map(jnp.asarray, (frequencies, mixing, spectra))
-        return cls(*parts, _residual_spectra(skies, residual), names)
 
     def description(self) -> tuple[str, ...]:
         residual = "no residual" if self.residual is None else "a residual in each"

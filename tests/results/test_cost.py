@@ -42,9 +42,3 @@ def test_a_joint_posterior_that_does_not_fit_is_refused_with_what_would(monkeypa
     refuse(refused, cost.require_fits, found, scenario)
     monkeypatch.setattr(cost, "memory_limit", lambda: 3e9)
     refuse(r"3 GB.*lmax=\d\d\b", cost.require_fits, found, scenario)
-
-
-def test_the_maps_of_a_kernel_are_its_principal_spectra():
-    kernel = ["frequencies_mhz=[10,15,20,25,30]", "joint=true", "spectral.model=kernel"]
-    stiff, loose = (cost_of(*kernel, f"spectral.length={length}") for length in (10.0, 0.1))
-    assert stiff.n_unknowns < loose.n_unknowns == 5 * 81
