@@ -66,9 +66,6 @@ def _called(name: str, *arguments: bytes | int | float | np.ndarray) -> int:
 # 0.40 s and one product 0.49 s; recursive halving takes 0.35 s, but 0.1 GB more memory
 N_BLOCKS = 4
 
-# columns of the inverse of a triangle to compute at once
-INVERTED = 256
-
 # rows of a lower triangle to mirror at once
 MIRRORED = 128
 
@@ -261,18 +258,6 @@ def invert_lower(lower: Matrix, *, overwrite: bool = False) -> Matrix:
         _called("dtrtri", b"U", b"N", len(inverse), inverse, len(inverse))
         return inverse
     return solve_lower(jnp.tril(lower), jnp.eye(lower.shape[0]), transpose=False)
-
-
-def trace_of_inverse(lower: Float[np.ndarray, "n n"]) -> float:
-    """Return tr (L L^T)^-1 for lower triangular L, the sum of squares of L^-1."""
-    n, squares = len(lower), 0.0
-    for first, end in pairwise([*range(0, n, INVERTED), n]):
-        # columns of L^-1 begin at their own row
-        columns = np.eye(n - first, end - first, order="F")
-        letters, below = (b"L", b"U", b"T", b"N"), lower[first:, first:]
-        _called("dtrsm", *letters, *columns.shape, 1.0, below, n, columns, len(columns))
-        squares += float(np.vdot(columns, columns))
-    return squares
 
 
 def inverse_from_cholesky(lower: Matrix) -> Matrix:

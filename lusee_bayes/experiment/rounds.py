@@ -209,8 +209,9 @@ def settled(
     the first order in values then has no product with a change of the sky). With many data, this is
     first done with a regular subset of the times. Values move only part of the way if the step is
     long or oscillates. If no sky fits at the end, under any prior, the rounds restart up to six
-    times: about half of the values, or all, are drawn again from their prior, and the likeliest of
-    eight such instruments is the start. The result with the largest ln p counts.
+    times (of the subset only: if some data do not fit, neither do all): about half of the values,
+    or all, are drawn again from their prior, and the likeliest of eight such instruments is the
+    start. The result with the largest ln p counts.
 
     Parameters
     ----------
@@ -236,15 +237,18 @@ def settled(
         If N is not positive definite.
     """
     report = report or (lambda rounds, remark: None)
+    ways = OTHER_WAYS
     if start.sky is None:
         if (few := _fewer(setup, start)) is not None:
-            inference, step = _nearby(few[0], _beginning(*few), report)
+            inference, step = _nearby(few[0], _beginning(*few), report, ways)
+            # if some of the data do not fit, neither do all
+            ways = OTHER_WAYS if inference.fits else 0
             terms = (s.systematic for s in inference.expanded)
             fixed = {name for one in terms if not one.moves for name in one.names}
             values = (inference.around.values or {}).items()
             start = replace(start, values={n: v for n, v in values if n not in fixed})
         start = _beginning(setup, start)
-    inference, step = _nearby(setup, start, report)
+    inference, step = _nearby(setup, start, report, ways)
     moves, n_learned, learned, in_rounds, idle = np.inf, 0, None, rebuilds(setup), 0
     while True:
         last = not in_rounds or inference.rounds >= MAX_ROUNDS or idle == IDLE
@@ -290,10 +294,10 @@ def _fewer(setup: Setup, start: Around) -> tuple[Setup, Around] | None:
     return setup.select(keep), replace(start, data=data.select(keep))
 
 
-def _nearby(setup: Setup, around: Around, report: Report) -> tuple[Inference, _Step]:
-    """Run rounds until the map has nearly converged; if it does not fit, restart elsewhere."""
+def _nearby(setup: Setup, around: Around, report: Report, ways: int) -> tuple[Inference, _Step]:
+    """Run rounds until the map has nearly converged; while it does not fit, restart elsewhere."""
     best, step = _approached(setup, around, report)
-    for way in range(OTHER_WAYS):
+    for way in range(ways):
         if best.moving and not best.fits:
             other = _approached(setup, _elsewhere(setup, best, way), report)
             if other[0].posterior.log_evidence > best.posterior.log_evidence:
@@ -421,12 +425,11 @@ def _around(
                 gains = drifts.inferred(solved)[0]
                 slope = drifts.volume_slope(solution, _volume(solution))
             around = replace(around, gains=gains, gain_slope=slope)
-    exact = None
-    if around.tempered == 1.0 and inference.moving:
-        # with the unknowns at these values: the sky that they would hide scatters without bound
-        exact = _exact(setup, around)
-        around = replace(around, volume=_volume(exact.solution))
-    return around, step, exact
+    if around.tempered > 1.0 or not inference.moving:
+        return around, step, None
+    # with the unknowns at these values: the sky that they would hide scatters without bound
+    exact = _exact(setup, around)
+    return replace(around, volume=_volume(exact.solution)), step, exact
 
 
 def _beginning(setup: Setup, around: Around) -> Around:

@@ -369,9 +369,8 @@ class SpectralSection(Section):
     @classmethod
     def _before_the_kernel_went(cls, tree: Any) -> Any:
         """Scenarios of 0.1 contained its length, also where it had no effect."""
-        if isinstance(tree, dict) and tree.get("model") != "kernel":
-            return {key: value for key, value in tree.items() if (key, value) != ("length", 1.0)}
-        return tree
+        items = tree.items() if isinstance(tree, dict) else ()
+        return {key: value for key, value in items if (key, value) != ("length", 1.0)} or tree
 
     def require_channels(self, n: int) -> None:
         """Raise InputError if there are too few channels to share a posterior."""

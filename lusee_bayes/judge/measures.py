@@ -24,7 +24,7 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Ells, Modes, Pixels, Vector
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, modes_to_map, sum_over_m
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.linalg import trace_of_inverse
+from lusee_bayes.core.linalg import invert_lower
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.judge.coverage import latitudes, multipoles
 from lusee_bayes.linear.linear_gaussian import Solution
@@ -218,8 +218,8 @@ def expected_chi2(posterior: Posterior, n_data: int, variance: Modes | None = No
     if variance is not None and prior.independent and posterior.basis is None:
         power = np.asarray(prior.variance())
         return float(n_data - (1.0 - variance[power > 0] / power[power > 0]).sum())
-    lower = np.ascontiguousarray(posterior.lower)
-    return n_data - len(lower) + trace_of_inverse(lower)
+    inverse = invert_lower(np.asarray(posterior.lower))
+    return n_data - len(inverse) + float(np.vdot(inverse, inverse))
 
 
 def highest_altitude(observation: Observation, nside: int) -> Pixels:

@@ -25,7 +25,7 @@ from pydantic import Field
 
 from lusee_bayes.core.arrays import DataVector, ModesMatrix
 from lusee_bayes.core.harmonics import LARGEST_LMAX
-from lusee_bayes.core.linalg import checked_cholesky, times_lower
+from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, times_lower
 from lusee_bayes.core.section import Section, Treatment
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.noise.covariance import Factor
@@ -140,7 +140,10 @@ def sky_above(
 
 def _main_directions(white: Float[np.ndarray, "data modes"]) -> Float[np.ndarray, "modes few"]:
     """The fewest orthonormal directions that leave less than LEFT_OUT of a matrix's squares."""
-    # in a basis with no more directions than there are data
-    basis, triangle = np.linalg.qr(white.T)
-    squares, directions = np.linalg.eigh(triangle @ triangle.T)
-    return basis @ directions[:, np.searchsorted(np.cumsum(squares), LEFT_OUT) :]
+    if many := len(white) >= white.shape[1]:
+        squares, directions = np.linalg.eigh(gram_matrix(white))
+    else:  # in a basis with no more directions than there are data
+        basis, triangle = np.linalg.qr(white.T)
+        squares, directions = np.linalg.eigh(triangle @ triangle.T)
+    few = directions[:, np.searchsorted(np.cumsum(squares), LEFT_OUT) :]
+    return few if many else basis @ few

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -65,9 +66,11 @@ class Above:
     mean: Float[np.ndarray, " all"]
     power: Float[np.ndarray, " ells"]
 
-    @property
+    @cached_property
     def seen(self) -> tuple[Float[Array, "data rank"], DataVector]:
         """Root and mean of the contribution to the data, in K."""
+        if self.coupling.shape[0] < self.coupling.shape[1]:
+            return np.asarray(self.coupling.dense()) @ self.root, self.coupling @ self.mean
         root = in_threads(self.coupling.__matmul__, list(np.ascontiguousarray(self.root.T)))
         return np.reshape(root, (-1, self.coupling.shape[0])).T, self.coupling @ self.mean
 
