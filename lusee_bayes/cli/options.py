@@ -115,7 +115,9 @@ class Options:
 
     def running(self) -> dict[str, Any]:
         """Arguments of every run."""
-        stages = Stages(Console(quiet=self.quiet, soft_wrap=True), verbose=self.verbose)
+        stages = Stages(
+            Console(quiet=self.quiet, soft_wrap=True, emoji=False), verbose=self.verbose
+        )
         return {"replace": self.force, "stages": stages}
 
     def print(self, *lines: object, files: Sequence[Path] = ()) -> None:
@@ -255,7 +257,7 @@ class ChainOptions:
 
 def say(*lines: object, quiet: bool = False, stderr: bool = False) -> None:
     """Print lines without markup, and tables with wrapped cells in the width of the terminal."""
-    console = Console(quiet=quiet, stderr=stderr)
+    console = Console(quiet=quiet, stderr=stderr, emoji=False)
     for line in lines:
         if isinstance(line, Table):
             console.print(line)

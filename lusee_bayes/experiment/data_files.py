@@ -153,12 +153,11 @@ def _require_same_reduction(path: Path, scenario: Scenario) -> None:
     for section, keys in OF_REDUCTION.items():
         given = whole.get(section) or {}
         for key in sorted(keys & given.keys()):
-            value = given[key]
-            said = made.get(section, given).get(key, value)
-            if said != value:
+            said = made.get(section, given).get(key, given[key])
+            if said != given[key]:
                 raise InputError(
-                    f"{path} was reduced with {section}.{key}={said}, the scenario has {value}; "
-                    f"reduce the sessions again, or remove {section}.{key}"
+                    f"{path} was reduced with {section}.{key}={said}, not {given[key]} as in the "
+                    f"scenario; reduce the sessions again, or remove {section}.{key}"
                 )
 
 

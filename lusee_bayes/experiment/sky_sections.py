@@ -308,8 +308,8 @@ def _complete_prior(tree: dict[str, Any]) -> None:
     isotropic = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
     if isotropic and not tree.get("model"):
         tree["model"] = "isotropic"
-    if tree.get("model") != "isotropic":  # another kind replaces the paper's prior
-        tree.pop("spectrum", None)
+    if tree.get("model") != "isotropic" and tree.get("spectrum") == "sky":
+        del tree["spectrum"]  # another kind replaces the paper's prior
 
 
 PriorSection = one_of(PRIOR_SECTIONS, _complete_prior)

@@ -165,10 +165,10 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     unseen = sorted(unseen, key=lambda spot: -spot.bias)[:MOST_NAMED]
     named = ", ".join(f"{one.name} by {one.size:g}{one.unit} ({one.bias:.2g})" for one in unseen)
     return (
-        "The model assumes an exact instrument, and residual chi2 would not reveal an error of "
-        f"{named}; in brackets, the resulting error of the map in standard deviations (rms). "
-        "noise.beam.parameters and noise.fields include such errors; a second turntable angle "
-        "reveals more of them."
+        f"Residual chi2 would not reveal an error of {named}, which the model assumes to be exact; "
+        "in brackets, the resulting error of the map in standard deviations (rms). "
+        "noise.beam.parameters and noise.fields include such errors; more turntable angles reveal "
+        "more of them."
     )
 
 

@@ -353,8 +353,8 @@ def read_waterfall(path: str | Path) -> Waterfall:
 
 HINT = "write netCDF (a name that does not end in .fits)"
 NO_ROOM = (
-    f"luseepy's waterfalls cannot store windows, but the samples have them; {HINT}, or simulate "
-    "with --set observation.window=instant"
+    f"luseepy's waterfalls hold instants at the turntable angle 0; {HINT}, or simulate with --set "
+    "observation.window=instant --set 'observation.runs=[{cycles: 1.0}]'"
 )
 
 
@@ -414,13 +414,9 @@ def _kelvin(path: Path, channels: Sequence[Visibilities]) -> ByTime:
     """Samples of all channels, NaN where missing; InputError if the layout cannot store them."""
     first = channels[0].observation
     for channel in channels:
-        if (observation := channel.observation).windows is not None:
+        observation = channel.observation
+        if observation.windows is not None or observation.turntable_deg != (0.0,):
             raise InputError(f"{path}: {NO_ROOM}")
-        if observation.turntable_deg != (0.0,):
-            raise InputError(
-                f"{path}: luseepy's waterfalls cannot store turntable angles, the data have "
-                f"{observation.turntable_deg}; {HINT}"
-            )
         if channel.layout.n_products != products.N_ANTENNAS**2:
             raise InputError(f"{path}: expected {products.N_ANTENNAS**2} products; {HINT}")
         if observation.n_times != first.n_times or (observation.times != first.times).any():

@@ -32,7 +32,7 @@ def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: in
         furthest = int(np.argmax(r_hat))
         warnings.append(
             f"Not converged: R-hat is above {AGREE:g} for {above} of {len(names)} quantities, "
-            f"largest for {names[furthest]} ({r_hat[furthest]:.3f}). Raise --draws."
+            f"largest for {names[furthest]} ({r_hat[furthest]:.4g}). Raise --draws and --warmup."
         )
     least = PER_CHAIN * chains
     for column, what in (("ess_bulk", "bulk"), ("ess_tail", "tail")):

@@ -155,7 +155,9 @@ def signal_limit(
     def error_under(covariance: Square) -> float:
         columns = slopes(f, *values)
         normal = columns.T @ np.linalg.solve(covariance, columns)
-        return float(np.sqrt(np.linalg.inv(normal)[-1, -1]))
+        alike = f"{name}: a smooth spectrum of degree {order} looks the same; raise --order"
+        with refusing(alike, np.linalg.LinAlgError):
+            return float(np.sqrt(np.linalg.inv(normal)[-1, -1]))
 
     std, without = error_under(spectrum.covariance[k]), {}
     for source, shares in zip(spectrum.sources, spectrum.shares[:, k], strict=True):

@@ -304,7 +304,7 @@ class SkySpectrum:
         most = [f"{self.sources[j]} {self.shares[j, k, i]:.0%}" for i, j in enumerate(self.most(k))]
         cells = [[f"{value:,.1f}" for value in one] for one in columns.values()]
         mhz = [f"{value:g}" for value in self.frequency]
-        header = ["MHz", *columns, "most of the variance from"]
+        header = ["MHz", *columns, "largest share from"]
         return header, [list(one) for one in zip(mhz, *cells, most, strict=True)]
 
     def most(self, k: int) -> list[int]:

@@ -71,7 +71,8 @@ def run_simulate(
     path, stages = user_path(path), stages or Stages()
     require_new(path, replace=replace, inputs=inputs_of(scenario))
     is_waterfall = path.suffix == ".fits"
-    if is_waterfall and scenario.observation.window != "instant":
+    planned = scenario.observation.observation()
+    if is_waterfall and (planned.windows is not None or planned.turntable_deg != (0.0,)):
         raise InputError(f"{path}: {NO_ROOM}")
     if scenario.frequencies_mhz and not is_waterfall:
         raise InputError(
@@ -260,7 +261,6 @@ def _to_be_mapped(made: FlightSimulation, folder: Path) -> Scenario:
     seen = made.observation
     # windows are centred on times
     starts = later(seen.times, seen.windows.start_s).isot[np.unique(seen.run, return_index=True)[1]]
-    angles = list(zip(starts.tolist(), seen.turntable_deg, strict=True))
     said = {
         "gain_table": flight.gain_table or str(folder / GAINS),
         # a table written by the simulation contains it
@@ -268,7 +268,7 @@ def _to_be_mapped(made: FlightSimulation, folder: Path) -> Scenario:
         "bin_origin": made.origin,
         "clock": str(folder / CLOCK) if made.section.clock == "unknown" else None,
         "turntable_deg": seen.turntable_deg[0],
-        "turns": dict(angles[1:]),
+        "turns": dict(list(zip(starts.tolist(), seen.turntable_deg, strict=True))[1:]),
         "site": "file",
         "simulated": made.section,
     }

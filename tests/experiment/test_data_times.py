@@ -145,7 +145,7 @@ def test_waterfalls_are_instants_unless_the_scenario_says_other(tmp_path):
 
 def test_waterfalls_have_no_room_for_windows(tmp_path):
     data = lb.build(scenario("observation.window=mean")).data
-    words = r"cannot store windows.*observation\.window=instant"
+    words = r"hold instants.*observation\.window=instant"
     refuse(words, write_waterfall, tmp_path / "w.fits", 2 * [data])
     assert not list(tmp_path.iterdir())
 

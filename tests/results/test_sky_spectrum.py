@@ -93,7 +93,7 @@ def test_files_have_the_spectrum_with_its_covariance(joint, tmp_path, capsys):
         assert np.linalg.eigvalsh(one).min() > 0.0
     assert run("spectrum", tmp_path / "cube", "--signal", "trough:24:2", "--order", "1") == 0
     printed = capsys.readouterr().out
-    assert "most of the variance from" in printed and "trough at 24 MHz" in printed
+    assert "largest share from" in printed and "trough at 24 MHz" in printed
     (tmp_path / "rae.csv").write_text("frequency_mhz,temperature_k\n19,8e4\n22,5e4\n")
     shown = ["--figure", tmp_path / "spectrum.png", "--table", tmp_path / "rae.csv"]
     assert run("spectrum", tmp_path / "cube", *shown[2:]) == 2

@@ -98,7 +98,7 @@ def _figures(panels: Mapping[str, tuple], channel: ChannelResult) -> Panels:
 
 def spectra(result: MapResult) -> Figure | Panels:
     """Power spectra of one channel, or brightness against frequency of several."""
-    return channel_spectra(result) if len(result.channels) > 1 else sky_spectra(result.channel)
+    return sky_spectra(result.channel) if result.single else channel_spectra(result)
 
 
 def plot_map(sky: MapResult | Posterior | Modes, nside: int = 64) -> Figure:
@@ -370,9 +370,9 @@ def spectral_index(cube: MapResult) -> Panels | None:
 def fidelity(cube: MapResult) -> Figure | Panels:
     """SNR_ell (or, without a truth, the prior's share) over frequency and ell, and its mean.
 
-    For one channel, as :func:`map_fidelity`.
+    For a map of one frequency, as :func:`map_fidelity`.
     """
-    if len(cube.channels) == 1:
+    if cube.single:
         return map_fidelity({"": cube.channel})
     with_truth = cube.stacked("snr") is not None
     values = cube.stacked("snr" if with_truth else "prior_fraction")
