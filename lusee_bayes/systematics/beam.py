@@ -91,7 +91,8 @@ class BeamErrors(Systematic):
             For unknown names, and for a prior that exceeds a parameter's domain.
         """
         if not section.parameters:
-            return BeamError(difference_of_beams(section, setup, around.values or {}))
+            direction = difference_of_beams(section, setup, around.values or {})
+            return BeamError(CouplingMatrix.of_modes(direction, setup.pointing, setup.layout))
         unknowns = []
         for name, std in section.parameters.items():
             p = setup.instrument.source.parameter(name)
@@ -168,30 +169,26 @@ class BeamError(BeamErrors):
 
     Attributes
     ----------
-    direction : (products, modes) or (runs, products, modes) array
-        The deviation for an amplitude of one, such as the difference to another beam.
-    gains : (data,) array or None
-        Later gains.
+    direction : CouplingMatrix
+        dA for an amplitude of one, such as that of the difference to another beam.
     """
 
     unknowns: ClassVar[tuple[Unknown, ...]] = (Unknown("beam_amplitude"),)
     first_order: ClassVar[bool] = False
 
-    direction: BeamModes
-    gains: DataVector | None = None
+    direction: CouplingMatrix
 
     def behind(self, gains: DataVector) -> BeamError:
-        return replace(self, gains=np.asarray(gains))
+        return replace(self, direction=self.direction.with_response(np.asarray(gains)))
 
     def effect(self, model, values):
         """Use A of these beams."""
-        modes = model.coupling.modes + values["beam_amplitude"] * self.direction
+        modes = model.coupling.modes + values["beam_amplitude"] * self.direction.modes
         return replace(model, coupling=model.coupling.of(modes=modes))
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add dA (S + mu mu^T) dA^T to N."""
-        direction = replace(model.coupling.of(modes=self.direction), response=self.gains)
-        noise = instrument_errors.beam_error_noise(direction, model.prior)
+        noise = instrument_errors.beam_error_noise(self.direction, model.prior)
         return replace(model, noise=model.noise + noise)
 
 

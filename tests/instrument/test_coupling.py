@@ -217,7 +217,7 @@ def test_sites_of_the_antennas_parameters(instrument, base):
 def test_the_amplitude_of_a_beam_error(instrument, base, pointing, layout):
     other = lb.monopole_beams(29.0, LOW)
     own = instrument.beams()
-    error = BeamError(other.modes - own.modes)
+    error = BeamError(CouplingMatrix.of_modes(other.modes - own.modes, pointing, layout))
     sky = base.prior.sample(jax.random.key(3))
     for amplitude in (0.0, 0.7, 1.0):
         value = {"beam_amplitude": jnp.asarray(amplitude)}
