@@ -502,7 +502,7 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
         for m in best(of_model, whole)
     ]
     excess = EXPLAINED * abs(base.chi2 - base.degrees)
-    nearly = [one for one in proposals if one.excess < excess]
+    nearly = [one for one in proposals if one.excess < excess and not one.chi2.too_small]
     # these always absorb part of any misfit, and count only if they absorb all of it
     proposals += _noise_level(residuals, data)
     others = list(_correlated_noise(judge))

@@ -424,7 +424,7 @@ def contiguous(middles: Time, half: Times, step_s: float, live_s: Live = None) -
     """
     rounding = _rounding(step_s)
     overlap = half[:-1] + half[1:] - np.diff(seconds_from(middles[0], middles))
-    cut = np.where((overlap > 0.0) & (overlap <= rounding), overlap / 2.0, 0.0)
+    cut = np.where((overlap > ROUNDING_S) & (overlap <= rounding), overlap / 2.0, 0.0)
     start, end = np.append(0.0, cut) - half, half - np.append(cut, 0.0)
     if live_s is not None:
         rounded = (live_s > end - start) & (live_s <= end - start + rounding)

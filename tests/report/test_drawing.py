@@ -82,9 +82,9 @@ def test_good_draws_are_not_warned_of():
 
 
 REASONS = [
-    ({"r_hat": [1.002, 1.09]}, ("Not converged", "(1.090)")),
+    ({"r_hat": [1.002, 1.09]}, ("Not converged", "(1.09)")),
     ({"r_hat": [np.inf, 1.0]}, ("Not converged", "(inf)")),
-    ({"r_hat": [1.002, 1.03]}, ("R-hat", "1 of 2", "C_5 [K2] (1.030)", "--draws")),
+    ({"r_hat": [1.002, 1.03]}, ("R-hat", "1 of 2", "C_5 [K2] (1.03)", "--draws")),
     ({"ess_bulk": [399.0, 900.0]}, ("bulk", "below 400", "T(centre) [K] (399)")),
     ({"ess_tail": [399.0, 12.0]}, ("tail", "2 of 2", "C_5 [K2] (12)")),
     ({"sampling": {"divergences": 3}}, ("3 trajectories diverged", "--warmup")),

@@ -131,7 +131,7 @@ def plain_ticks(axes: Axes, n: int = 4) -> None:
     """At most ``n`` ticks on each axis, labelled with full numbers instead of an offset."""
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(n))
-        axis.set_major_formatter(StrMethodFormatter("{x:,.6g}"))
+        axis.set_major_formatter(StrMethodFormatter("{x:,.8g}"))
 
 
 def side_by_side(axes: Axes, data: Float[np.ndarray, "n times"], products: Sequence[str]) -> None:

@@ -38,7 +38,7 @@ def data_vector(result: MapResult) -> Figure | None:
     if not result.single:
         return None
     channel = result.channel
-    figure, (axes,) = drawing.in_places((11, 4), left=0.08, right=0.99, bottom=0.13, top=0.91)
+    figure, (axes,) = drawing.in_places((11, 4), left=0.095, right=0.99, bottom=0.13, top=0.91)
     drawing.side_by_side(axes, channel.data, channel.labels)
     missing = f", {channel.n_missing} missing" if channel.n_missing else ""
     samples = f"{channel.n_data} samples{missing}"

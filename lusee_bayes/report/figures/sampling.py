@@ -48,7 +48,8 @@ def pairs(quantities: Quantities) -> Figure:
     size, title = (side, side), "Pairs of quantities"
     figure = _drawn(arviz_plots.plot_pair, chosen, title, size, visuals=visuals)
     for axes in figure.axes:
-        drawing.plain_ticks(axes, 3)
+        drawing.plain_ticks(axes, 2)
+        axes.tick_params(labelsize=7)
     return figure
 
 
