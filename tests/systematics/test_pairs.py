@@ -40,7 +40,7 @@ POLARISED = "noise.polarisation={linear: 0.03, circular: 0.03, lmax: 4}"
 # drifts, what they multiply besides the sky
 MARGINALISED = [
     ("noise.gain_table={std: 0.01}", SHIFT),
-    (DRIFTS, POLARISED),
+    pytest.param((DRIFTS, POLARISED), marks=[pytest.mark.long, pytest.mark.essential]),
     pytest.param((DRIFTS, "noise.beam={shift_mhz: 4.0}"), marks=pytest.mark.long),
 ]
 
@@ -67,7 +67,7 @@ def test_the_volume_of_skies_is_that_of_a_known_pointing():
 
 BESIDES = [
     "noise.above_lmax={least_lmax: 0, margin: 4}",
-    "noise.receiver={power_k: 1000.0, relative_std: 0.2}",
+    pytest.param("noise.receiver={power_k: 1000.0, relative_std: 0.2}", marks=pytest.mark.long),
     pytest.param(POLARISED, marks=pytest.mark.long),
     pytest.param("noise.gain_table={std: 0.01}", marks=pytest.mark.long),
 ]
