@@ -143,9 +143,10 @@ class Residuals:
             advice = TOO_WIDE if self.split.prior.too_small else TOO_NARROW
             sky = f"The sky is {self.split.prior.of_sky} ({prior}); instrument and noise fit "
             return Fit(level, " ".join(filter(None, [f"{sky}({instrument}).", strengths, advice])))
-        small = self.split.instrument.too_small and not self.extremes()
+        off = self.extremes()
+        small = self.split.instrument.too_small and all(one.chi2 < one.degrees for one in off)
         why = "The noise is smaller than assumed" if small else "No sky explains these data"
-        return Fit(level, " ".join([f"{why} ({instrument}).", *self._blame()]))
+        return Fit(level, " ".join([f"{why} ({instrument}).", *([] if small else self._blame())]))
 
     def _blame(self) -> list[str]:
         """Which groups stand out, and which to exclude."""

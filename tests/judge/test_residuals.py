@@ -199,6 +199,9 @@ def test_what_no_group_explains():
     found = judged(model, corrupted(data, slice(None), noise * rng.standard_normal((16, 24))))
     assert found.suspects() == []
     assert "any one of them is not enough" in found.fit().text
+    # noise a hundred times too large, in every group
+    quiet = judged(replace(model, noise=model.noise.scaled(1e4)), data).fit()
+    assert "The noise is smaller than assumed" in quiet.text and "exclud" not in quiet.text
 
 
 # --- chi^2 in two parts ---------------------------------------------------------------------------
