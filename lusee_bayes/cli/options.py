@@ -190,6 +190,8 @@ class DataOptions(ScenarioOptions):
 
     def load(self, source: str, **entries: object) -> Scenario:
         """As :meth:`ScenarioOptions.load`, with the clock."""
+        if self.clock is not None and self.data is None:
+            raise InputError("--clock is for session files; give them with --data")
         return super().load(source, flight__clock=self.clock, **entries)
 
     def running(self) -> dict[str, Any]:

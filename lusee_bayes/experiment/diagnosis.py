@@ -400,6 +400,8 @@ SCREENED_LMAX = 12
 TRIED, PROMISING = 3, 0.1
 # if nothing makes the data fit, list mistakes that leave less than this fraction of the excess
 EXPLAINED = 0.03
+# any mistake must reduce the excess by more than this number of standard deviations
+SIGNIFICANT = 10.0
 # mistakes are indistinguishable for these antennas if their chi^2 differ by less, relative
 SAME = 1e-5
 # ells to add to lmax
@@ -431,6 +433,12 @@ class Proposal:
         """Distance of chi^2 from its expected value."""
         return abs(self.chi2.chi2 - self.chi2.degrees)
 
+    def improves(self, before: ChiSquare) -> bool:
+        """Whether it brings chi^2 much closer to its expected value than it was before."""
+        free = max(before.degrees - self.chi2.degrees, 1.0)
+        gained = abs(before.chi2 - before.degrees) - self.excess
+        return gained > SIGNIFICANT * (2.0 * free) ** 0.5
+
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -451,10 +459,15 @@ class Diagnosis:
     proposals: tuple[Proposal, ...]
     n_tried: int
 
+    @property
+    def explains(self) -> bool:
+        """Whether a usual mistake explains the misfit."""
+        return any(one.chi2.fits for one in self.proposals)
+
     def sentences(self) -> list[str]:
         """The proposals, one sentence each; or one sentence if there are none."""
-        if self.chi2.fits:
-            return [f"The data fit without assuming a mistake ({self.chi2.words()})."]
+        if not self.proposals and self.chi2.fits:
+            return [f"As a whole, the data fit without assuming a mistake ({self.chi2.words()})."]
         if not self.proposals:
             return [f"None of the {self.n_tried} usual mistakes explains the misfit."]
         first = "Did you mean" if self.proposals[0].chi2.fits else "Closest, but not enough"
@@ -508,8 +521,8 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     others = list(_correlated_noise(judge))
     if not any(one.chi2.fits for one in [*proposals, *others]):
         others += _finer(judge)
-    proposals += others
-    listed = [one for one in proposals if one.chi2.fits] or nearly
+    fitting = [one for one in (*proposals, *others) if one.chi2.fits]
+    listed = [one for one in fitting or nearly if one.improves(base)]
     listed.sort(key=lambda one: one.excess)
     return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + 1 + len(others))
 

@@ -281,9 +281,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     @cache
     def around() -> Around:
         # without such values, large offsets are not described, and gains belong to other antennas
-        if not rounds.rebuilds(setup):
-            return Around(data)
-        return infer(experiment).around
+        return infer(experiment).around if rounds.rebuilds(setup) else Around(data)
 
     to_sample = cache(lambda: model_to_sample(setup, around()))
     return {

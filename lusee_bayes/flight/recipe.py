@@ -27,14 +27,7 @@ from lusee_bayes.flight.session import BinOrigin, Session
 from lusee_bayes.instrument.averaging import bins_of
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import CONVENTIONS
-from lusee_bayes.instrument.times import (
-    TO_MIDDLE,
-    Timestamp,
-    contiguous,
-    later,
-    utc_of,
-    utc_times,
-)
+from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, contiguous, later, utc_of, utc_times
 
 Share = Annotated[float, Field(ge=0, le=0.5)]
 Levels = Annotated[str, Field(pattern="^[LMH]{4}$")]

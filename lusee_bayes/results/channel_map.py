@@ -264,12 +264,14 @@ class Conditioned:
                 instrument = Split.of(*given, None if joint else self.expected).instrument
             if alone or thorough or instrument.p < DOUBTFUL:
                 left = residuals(judge, data)
-                instrument, judged = left.split.instrument, self._judged(left)
+                instrument = left.split.instrument
             details = _details(self) if alone else None
-        bad = judged is not None and judged.level == "does not fit"
+        bad = left is not None and left.level() == "does not fit"
         if bad or thorough:
             with stages("usual mistakes"):
                 diagnosis = diagnose(experiment, inference, left)
+        if left is not None:
+            judged = self._judged(left, explained=diagnosis is not None and diagnosis.explains)
         if scenario.noise.pointing is not None or bad:
             with stages("clock and pointing"):
                 pointing = pointing_report(experiment, inference)
@@ -322,14 +324,14 @@ class Conditioned:
         w = solve_lower(lower, fluxes.with_all[:, shared].T, transpose=False).T
         return np.concatenate([self.covariance, fluxes.with_sky]), w
 
-    def _judged(self, misfit: Residuals) -> Judged:
+    def _judged(self, misfit: Residuals, *, explained: bool) -> Judged:
         """Describe the residuals, with the verdict in words."""
         layout, prior = self.experiment.data.layout, self.from_all.model.prior
         expected = prior.variance() - np.diagonal(self.covariance)
         left, before = self.without_monopole
         moved = self.posterior.mean - prior.colour(prior.white_mean)
         strong = measures.strengths(moved, expected, before - left)
-        fit = misfit.fit(measures.strengths_in_words(strong))
+        fit = misfit.fit(measures.strengths_in_words(strong), explained=explained)
         return Judged(
             level=fit.level,
             verdict=fit.text,

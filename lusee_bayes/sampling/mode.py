@@ -39,13 +39,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, pixel_matrix, power_spectrum, synthesis_matrix
 from lusee_bayes.sampling.distributions import HALF_LOG_2PI, Prediction
 from lusee_bayes.sampling.hmc import Whitening, whitened
-from lusee_bayes.sampling.programs import (
-    DATA,
-    WHITE_SUFFIX,
-    Program,
-    latent_of,
-    numpyro_promotion,
-)
+from lusee_bayes.sampling.programs import DATA, WHITE_SUFFIX, Program, latent_of, numpyro_promotion
 from lusee_bayes.systematics.systematic import MOST_COLLAPSED, Chart
 
 # recurring types of arrays

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from lusee_bayes.core.arrays import Array, DataVector, Grid
 from lusee_bayes.core.lazy import dist, numpyro
-from lusee_bayes.core.section import Positive, Section, Treatment, requires
+from lusee_bayes.core.section import NOT_TINY, Positive, Section, Treatment, requires
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian, Solution
 from lusee_bayes.noise.instrument_errors import (
@@ -49,6 +49,8 @@ SCALES = ("gain_sigma", "gain_log_correlation")
 PER_CORRELATION, MARGIN = 3.0, 6.0
 # number folded into the scenario's seed for the scales
 SCALE_DRAW = 6
+# standard deviation of the ln of a scale
+LogStd = Annotated[float, Field(gt=0, le=1)]
 # all threads, in which channels and cases are simulated, share NumPyro's handlers
 _HANDLERS = threading.Lock()
 
@@ -76,10 +78,10 @@ class GainSection(Section):
         drifts about those that the data determine (iterative).
     """
 
-    sigma: Positive = 0.01
+    sigma: Annotated[float, Field(gt=0, le=STRONGEST), NOT_TINY] = 0.01
     correlation_h: Positive = 10.0
-    log_sigma_std: Positive | None = None
-    log_correlation_std: Annotated[float, Field(gt=0, le=1)] | None = None
+    log_sigma_std: LogStd | None = None
+    log_correlation_std: LogStd | None = None
     treatment: Treatment = "marginalised"
     visibilities: NoiseAbout | None = None
 

@@ -169,9 +169,8 @@ class Unknown(eqx.Module):
 
     def at(self, z: float | Float[Array, "..."]) -> float | Float[Array, "..."]:
         """Compute values from numbers in prior standard deviations from the prior mean."""
-        if self.log:
-            return self.mean * namespace(z).exp(self.std * z)
-        return self.mean + self.std * z
+        off = self.std * z
+        return self.mean * namespace(z).exp(off) if self.log else self.mean + off
 
 
 class Systematic(eqx.Module):

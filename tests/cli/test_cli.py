@@ -20,16 +20,7 @@ import xarray as xr
 from assertions import raising, refuse
 from astropy.io import fits
 from astropy.table import Table
-from commands import (
-    assert_drawn,
-    content,
-    posterior_of,
-    python,
-    refused,
-    run,
-    sky_draws_of,
-    table_of,
-)
+from commands import assert_drawn, content, posterior_of, python, refused, run, sky_draws_of
 from rich.console import Console
 
 import lusee_bayes
@@ -41,12 +32,7 @@ from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
 from lusee_bayes.core.version import COMMAND
 from lusee_bayes.experiment.scenario import OutputSection, load_scenario, scenario_names
 from lusee_bayes.judge.chi2 import HEADLINES
-from lusee_bayes.results.finished_runs import (
-    FinishedRun,
-    comparison_rows,
-    evidence_caveat,
-    read_channels,
-)
+from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs import map_run as runs
 from lusee_bayes.runs.folder import Output
@@ -84,8 +70,8 @@ def test_the_files_agree_with_each_other(folder):
     y = pixel_matrix(nside, 8)
     np.testing.assert_allclose(got, np.sqrt(np.einsum("pi,ij,pj->p", y, covariance, y)), rtol=1e-6)
     np.testing.assert_allclose(kelvin - truth, residual, rtol=0, atol=1e-9 * kelvin.max())
-    (channel,) = read_channels(folder / "diagnostics.nc")
-    np.testing.assert_array_equal(observed, channel.highest_altitude >= 0)
+    never_rises = FinishedRun.read(folder).channel.highest_altitude < 0
+    np.testing.assert_array_equal(observed, ~never_rises)
     skies = sky_draws_of(folder)[0][:100]
     assert len(drawn) == 100
     np.testing.assert_allclose(drawn[7], modes_to_map(skies[7], nside), rtol=1e-10)
@@ -95,11 +81,11 @@ def test_the_files_agree_with_each_other(folder):
     # sqrt(2) there and back again
     alm = healpy.read_alm(folder / "mean_alm.fits")
     np.testing.assert_allclose(from_healpy(alm), mean, rtol=4e-16)
-    rows = table_of(folder / "power_spectra.ecsv")
-    assert Table.read(folder / "power_spectra.ecsv")["cl_mean"].unit == "K2"
+    table = Table.read(folder / "power_spectra.ecsv")
+    assert table["cl_mean"].unit == "K2"
     columns = "frequency_mhz ell rho snr cl_prior cl_mean cl_truth cl_posterior_variance"
-    assert list(rows[0])[:8] == columns.split()
-    assert float(rows[2]["cl_posterior_variance"]) == pytest.approx(np.mean(std[4:9] ** 2))
+    assert table.colnames[:8] == columns.split()
+    assert table["cl_posterior_variance"][2] == pytest.approx(np.mean(std[4:9] ** 2))
     summary = json.loads((folder / "summary.json").read_text())
     assert (summary["n_data"], summary["n_modes"]) == (16 * 64, 81)
 
@@ -308,9 +294,18 @@ def with_data(run, name, change):
     return replace(run, name=name, channels=(replace(run.channel, data=change(run.channel.data)),))
 
 
-@pytest.mark.parametrize(("arguments", "code"), [(["keys"], 0), (["map", "no.yaml"], 2)])
-def test_what_a_program_calls_next_is_not_said_to_be_of_a_command_before(arguments, code, capsys):
-    assert run(*arguments) == code
+CALLS = [
+    ("keys", 0, ""),
+    ("map no.yaml", 2, "no.yaml"),
+    ("map fiducial --clock=c.json", 2, "--clock is for session files"),
+    ("map --lmax 8", 2, "Unknown option: --lmax. Keys of a scenario are set with --set KEY=VALUE"),
+]
+
+
+@pytest.mark.parametrize(("line", "code", "words"), CALLS)
+def test_a_call_ends_with_a_code_and_leaves_no_trace_of_its_command(line, code, words, capsys):
+    assert run(*line.split()) == code
+    assert words in capsys.readouterr().err
     assert COMMAND.get() == ""
 
 

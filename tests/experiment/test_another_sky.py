@@ -22,6 +22,7 @@ from lusee_bayes.experiment.model import radiometer, set_up, simulate, true_valu
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.instrument.products import to_matrix, to_real
+from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.noise.instrument_errors import with_gains
 from lusee_bayes.systematics.context import Around
@@ -268,6 +269,14 @@ def test_absent_samples_do_not_matter():
 
     _, found = diagnosed(replace(wrong_data.WRONG[0], make=make))
     assert is_named(wrong_data.WRONG[0], found) and found.proposals[0].chi2.fits
+
+
+def test_a_mistake_is_proposed_even_if_only_groups_of_data_do_not_fit():
+    whole, closer = ChiSquare(5412.0, 5136.0), ChiSquare(4948.0, 4947.0)
+    finer = diagnosis.Proposal("lmax is too low", "use --set lmax=16", closer)
+    assert whole.fits and finer.improves(whole)
+    assert not replace(finer, chi2=ChiSquare(5405.0, 5135.0)).improves(whole)
+    assert "Did you mean" in diagnosis.Diagnosis(whole, (finer,), 9).sentences()[0]
 
 
 def test_chi2_of_mixed_data_is_that_of_matrices():

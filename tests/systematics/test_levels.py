@@ -131,10 +131,7 @@ def test_several_at_once(case):
     mean, term = columns @ flux + 3.0 * other[:, 0], 16.0 * other @ other.T
     hidden = systematic.Marginalised(hidden)
     # the order of those that do not touch the noise is all the same
-    for order in (
-        [LEVEL, spectrum(3), source, hidden],
-        [source, LEVEL, hidden, spectrum(3)],
-    ):
+    for order in ([LEVEL, spectrum(3), source, hidden], [source, LEVEL, hidden, spectrum(3)]):
         expected = case.evidence(factors, level, term, mean) + priors
         assert general(case, order, values) == pytest.approx(expected, rel=CLOSE)
     # a level behind the marginalised source scales that, too
