@@ -41,9 +41,8 @@ Merge = Callable[[R, R], R]
 
 def processors() -> int:
     """The number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    mine = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))
+    return len(mine(0))
 
 
 def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:

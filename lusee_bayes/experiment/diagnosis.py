@@ -405,7 +405,7 @@ SIGNIFICANT = 10.0
 # mistakes are indistinguishable for these antennas if their chi^2 differ by less, relative
 SAME = 1e-5
 # ells to add to lmax
-MORE_ELLS = 8
+BEYOND, MORE_ELLS = "the sky has structure beyond lmax", 8
 # offsets to solve for, and decreasing steps in degrees to either side
 OFFSETS, REACHES = ("turntable_deg", "tilt_east_deg", "tilt_north_deg"), (4.0, 0.5)
 # limit on the sum of products of neighbouring times, in standard deviations for white noise
@@ -460,9 +460,9 @@ class Diagnosis:
     n_tried: int
 
     @property
-    def explains(self) -> bool:
-        """Whether a usual mistake explains the misfit."""
-        return any(one.chi2.fits for one in self.proposals)
+    def is_truncation(self) -> bool:
+        """Whether structure of the sky beyond lmax explains the misfit."""
+        return any(BEYOND in one.words and one.chi2.fits for one in self.proposals)
 
     def sentences(self) -> list[str]:
         """The proposals, one sentence each; or one sentence if there are none."""
@@ -555,7 +555,7 @@ def _finer(judge: UnderAnySky) -> Iterator[Proposal]:
     except InputError:  # the beams of a file end at a lower ell
         return
     chi2 = judge.under(beams, setup.observation, Pointing.of(setup.observation, lmax))
-    yield Proposal("the sky has structure beyond lmax", f"use --set lmax={lmax}", chi2)
+    yield Proposal(BEYOND, f"use --set lmax={lmax}", chi2)
 
 
 def _offsets(judge: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMistake]]:

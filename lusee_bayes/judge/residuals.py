@@ -127,15 +127,15 @@ class Residuals:
         groups = [one for one in looked_at if not stands_out(one.others_p, self.n_tests)]
         return sorted(groups, key=lambda group: (KINDS.index(group.kind), group.p))
 
-    def fit(self, strengths: str = "", *, explained: bool = False) -> Fit:
+    def fit(self, strengths: str = "", *, truncated: bool = False) -> Fit:
         """Judge whether the data fit, and recommend a remedy if not.
 
         Parameters
         ----------
         strengths : str
             Sentence on the strength of the sky relative to its prior, by place and scale.
-        explained : bool
-            Whether a usual mistake explains a misfit, so that no data need to be excluded.
+        truncated : bool
+            Whether structure beyond lmax explains a misfit, so that no data are to be excluded.
         """
         level = self.level()
         instrument, prior = (part.words() for part in (self.split.instrument, self.split.prior))
@@ -148,21 +148,21 @@ class Residuals:
         off = self.extremes()
         small = self.split.instrument.too_small and all(one.chi2 < one.degrees for one in off)
         why = "The noise is smaller than assumed" if small else "No sky explains these data"
-        blame = [] if small else self._blame(explained)
+        blame = [] if small else self._blame(truncated)
         return Fit(level, " ".join([f"{why} ({instrument}).", *blame]))
 
-    def _blame(self, explained: bool) -> list[str]:
-        """Which groups stand out and, if nothing else explains the misfit, which to exclude."""
+    def _blame(self, truncated: bool) -> list[str]:
+        """Which groups stand out and, unless lmax is too low, which to exclude."""
         if not self.groups:
             return [
                 "Products, days and turntable angles were not tested: the noise couples different "
                 "times, so that the test would need all of A."
             ]
         parts, extremes, suspects = [], self.extremes(), self.suspects()
-        if (suspects or explained) and extremes:
+        if (suspects or truncated) and extremes:
             named = in_brief([f"{group} (p {probability(group.p)})" for group in extremes])
             parts.append(f"Of {len(self.compared())} groups, these are inconsistent: {named}.")
-        if explained:
+        if truncated:
             return parts
         for kind in KINDS:
             mine = [group for group in suspects if group.kind == kind]

@@ -271,7 +271,8 @@ class Conditioned:
             with stages("usual mistakes"):
                 diagnosis = diagnose(experiment, inference, left)
         if left is not None:
-            judged = self._judged(left, explained=diagnosis is not None and diagnosis.explains)
+            truncated = diagnosis is not None and diagnosis.is_truncation
+            judged = self._judged(left, truncated=truncated)
         if scenario.noise.pointing is not None or bad:
             with stages("clock and pointing"):
                 pointing = pointing_report(experiment, inference)
@@ -324,14 +325,14 @@ class Conditioned:
         w = solve_lower(lower, fluxes.with_all[:, shared].T, transpose=False).T
         return np.concatenate([self.covariance, fluxes.with_sky]), w
 
-    def _judged(self, misfit: Residuals, *, explained: bool) -> Judged:
+    def _judged(self, misfit: Residuals, *, truncated: bool) -> Judged:
         """Describe the residuals, with the verdict in words."""
         layout, prior = self.experiment.data.layout, self.from_all.model.prior
         expected = prior.variance() - np.diagonal(self.covariance)
         left, before = self.without_monopole
         moved = self.posterior.mean - prior.colour(prior.white_mean)
         strong = measures.strengths(moved, expected, before - left)
-        fit = misfit.fit(measures.strengths_in_words(strong), explained=explained)
+        fit = misfit.fit(measures.strengths_in_words(strong), truncated=truncated)
         return Judged(
             level=fit.level,
             verdict=fit.text,

@@ -187,7 +187,7 @@ def test_what_is_wrong_is_pointed_at(kind, name):
     assert (kind, name) in [(group.kind, group.name) for group in found.suspects()]
     for words in (f"{kind} {name}", "The others fit without"):
         assert words in found.fit().text
-    assert "are inconsistent: " in (text := found.fit(explained=True).text)
+    assert "are inconsistent: " in (text := found.fit(truncated=True).text)
     assert "without" not in text and "exclud" not in text
     # and no other of its kind
     assert len(found.suspects()) == len({group.kind for group in found.suspects()})
