@@ -433,11 +433,11 @@ class Proposal:
         """Distance of chi^2 from its expected value."""
         return abs(self.chi2.chi2 - self.chi2.degrees)
 
-    def improves(self, before: ChiSquare) -> bool:
-        """Whether it brings chi^2 much closer to its expected value than it was before."""
+    def suffices(self, before: ChiSquare) -> bool:
+        """Whether chi^2 fits without the mistake, and is much closer to its expected value."""
         free = max(before.degrees - self.chi2.degrees, 1.0)
         gained = abs(before.chi2 - before.degrees) - self.excess
-        return gained > SIGNIFICANT * (2.0 * free) ** 0.5
+        return self.chi2.fits and gained > SIGNIFICANT * (2.0 * free) ** 0.5
 
 
 @dataclass(frozen=True)
@@ -519,11 +519,11 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     # these always absorb part of any misfit, and count only if they absorb all of it
     proposals += _noise_level(residuals, data)
     others = list(_correlated_noise(judge))
-    if not any(one.chi2.fits for one in [*proposals, *others]):
-        others += _finer(judge)
-    fitting = [one for one in (*proposals, *others) if one.chi2.fits]
-    listed = [one for one in fitting or nearly if one.improves(base)]
-    listed.sort(key=lambda one: one.excess)
+    suffice = [one for one in (*proposals, *others) if one.suffices(base)]
+    if not suffice:
+        others += (finer := list(_finer(judge)))
+        suffice = [one for one in finer if one.suffices(base)]
+    listed = sorted(suffice or ([] if base.fits else nearly), key=lambda one: one.excess)
     return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + 1 + len(others))
 
 

@@ -274,8 +274,8 @@ def test_absent_samples_do_not_matter():
 def test_a_mistake_is_proposed_even_if_only_groups_of_data_do_not_fit():
     whole, closer = ChiSquare(5412.0, 5136.0), ChiSquare(4948.0, 4947.0)
     finer = diagnosis.Proposal("lmax is too low", "use --set lmax=16", closer)
-    assert whole.fits and finer.improves(whole)
-    assert not replace(finer, chi2=ChiSquare(5405.0, 5135.0)).improves(whole)
+    assert whole.fits and finer.suffices(whole)
+    assert not replace(finer, chi2=ChiSquare(5405.0, 5135.0)).suffices(whole)
     assert "Did you mean" in diagnosis.Diagnosis(whole, (finer,), 9).sentences()[0]
 
 
