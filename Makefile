@@ -28,7 +28,7 @@ essential: $(VENV)/installed-dev
 
 # the rest of the longer checks. Those that compute for longer than they compile come first, with
 # LLVM's optimisations, and each by itself; two of them use both processors for a quarter of an hour
-LONG := $(BIN)/python -m pytest -m "long and not essential" -n 2 -o faulthandler_timeout=3600
+LONG := $(BIN)/python -m pytest -m "long and not essential" -n 2 -o faulthandler_timeout=7200
 COMPUTING := $(addprefix tests/, sampling/test_hmc_full_size.py sampling/test_prior_amplitude.py \
 	sampling/test_calibration.py systematics/test_calibration_of_systematics.py)
 long: $(VENV)/installed-dev

@@ -49,8 +49,7 @@ def resolution_rows(posterior, directions) -> np.ndarray:
 
 def log_prob_slope(a, s, n, d, ds, dn) -> float:
     """d ln p(d) / dx for S(x), N(x) with derivatives ds, dn: (y^T dK y - tr K^-1 dK) / 2."""
-    k = a @ s @ a.T + n
-    dk = a @ ds @ a.T + dn
+    k, dk = a @ s @ a.T + n, a @ ds @ a.T + dn
     y = np.linalg.solve(k, d)
     return 0.5 * float(y @ dk @ y - np.trace(np.linalg.solve(k, dk)))
 

@@ -70,8 +70,7 @@ def mode_numbers(lmax: int) -> tuple[np.ndarray, np.ndarray]:
     """Return ``ell`` and ``m`` of every packed mode, two integer arrays of shape (modes,)."""
     require_whole("lmax", lmax, 0, LARGEST_LMAX)
     ell = np.repeat(np.arange(lmax + 1), 2 * np.arange(lmax + 1) + 1)
-    m = np.arange(n_modes(lmax)) - ell * (ell + 1)
-    return ell, m
+    return ell, np.arange(n_modes(lmax)) - ell * (ell + 1)
 
 
 def from_healpy(alm: Complex[np.ndarray, "*batch alms"]) -> Float[np.ndarray, "*batch modes"]:
@@ -355,8 +354,7 @@ class Rotation(eqx.Module):
 def _rotation(matrix: bytes, lmax: int) -> Rotation:
     turn = rotations.Rotation.from_matrix(np.frombuffer(matrix).reshape(3, 3)).as_rotvec()
     angle = np.linalg.norm(turn)
-    axis = turn / angle if angle else turn
-    blocks = []
+    axis, blocks = turn / angle if angle else turn, []
     for ell in range(lmax + 1):
         # the eigenvalues of i axis . K are integers
         values, vectors = np.linalg.eigh(1j * np.tensordot(axis, generators(ell), 1))

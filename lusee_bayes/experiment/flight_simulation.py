@@ -219,8 +219,7 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
         If the beams are not calibrated in volts, the scenario's samples or noise cannot be those of
         spectra, the gain table cannot be read, or a tone is in no bin.
     """
-    stages = stages or Stages()
-    flight = flight_of(scenario)
+    stages, flight = stages or Stages(), flight_of(scenario)
     section = flight.simulated or FlightSimulatedSection()
     radiometer, step_s = scenario.noise.radiometer, scenario.observation.step_s
     if radiometer.duty_cycle != 1.0 or radiometer.log_factor_std is not None:

@@ -338,8 +338,7 @@ def _elsewhere(setup: Setup, inference: Inference, way: int) -> Around:
         values, log_prior = {}, 0.0
         for part in parts:
             drawn = rng.standard_normal(len(part.centre))
-            kept = rng.random(len(drawn)) < KEPT[way % len(KEPT)]
-            z = np.where(kept, part.centre, drawn)
+            z = np.where(rng.random(len(drawn)) < KEPT[way % len(KEPT)], part.centre, drawn)
             values |= part.systematic.in_units(z)
             log_prior -= 0.5 * float(z @ z)
         exact = _exact(setup, Around(inference.around.data, values=values))
@@ -403,10 +402,10 @@ def _around(
     solved = solution.weighted_residual()
     if inference.moving:
         ways = [(s, s.expected + s.columns.T @ solved - s.centre) for s in inference.expanded]
-        # learned prior widths do not indicate how far the first order is valid
-        far = [way for s, way in ways if s.systematic.moves and not s.systematic.learns]
-        step = step.after(np.concatenate(far)) if far else step
-        values = {}
+        # learned prior widths indicate least how far the first order is valid
+        moving = [(s.systematic.learns, way) for s, way in ways if s.systematic.moves]
+        far = [way for learns, way in moving if not learns] or [way for _, way in moving]
+        step, values = step.after(np.concatenate(far)), {}
         for s, way in ways:
             values |= s.systematic.in_units(s.centre + step.size * way)
             if s.systematic.learns and around.tempered == 1.0:

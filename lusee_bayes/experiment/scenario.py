@@ -308,6 +308,14 @@ class Scenario(Section):
                 f"marginalise; {advice}"
             )
 
+    def require_single(self, what: str) -> None:
+        """Raise InputError for several frequencies, for commands with one."""
+        if not self.single:
+            raise InputError(
+                f"{what} one frequency; give a scenario with frequency_mhz and without "
+                "frequencies_mhz"
+            )
+
     @property
     def map_nside(self) -> int:
         """NSIDE of written maps: at least two pixels per ell."""

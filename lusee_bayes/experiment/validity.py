@@ -139,7 +139,7 @@ class BlindSpot:
         Its standard deviation, in ``unit``.
     unit : str
     bias : float
-        Move of the map: rms over modes, in posterior standard deviations.
+        Move of the map: rms over independent directions, in posterior standard deviations.
     shown : float
         Rise of the residual chi^2, in standard deviations of chi^2.
     """
@@ -166,7 +166,8 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     named = ", ".join(f"{one.name} by {one.size:g}{one.unit} ({one.bias:.2g})" for one in unseen)
     return (
         f"Residual chi2 would not reveal an error of {named}, which the model assumes to be exact; "
-        "in brackets, the resulting error of the map in standard deviations (rms). "
+        "in brackets, the resulting error of the map in standard deviations (rms over independent "
+        "directions). "
         "noise.beam.parameters and noise.fields include such errors; more turntable angles reveal "
         "more of them."
     )
@@ -216,8 +217,7 @@ def blind_spots(
     for systematic, sizes, unit in errors_of(moved_setup, pointing=pointing):
         if has.issuperset(sizes):
             continue
-        centre = np.zeros(len(systematic.names))
-        columns = np.asarray(systematic.linearised(model, centre)(sky))
+        columns = np.asarray(systematic.linearised(model, np.zeros(len(systematic.names)))(sky))
         solved = np.asarray(solution.factor.solve(columns))
         pull = np.asarray(inference.model.coupling.transpose_mv(solved))
         moves = ((root.T @ pull) ** 2).sum(0)
@@ -242,7 +242,8 @@ def about_sky_above(setup: Setup) -> str:
     return (
         f"The sky above lmax = {lmax} adds about {added:.2g} standard deviations of the noise to "
         "every datum (rms). It is marginalised, which makes error bars larger. Above lmax = "
-        f"{enough} it would add less to chi2 than chance."
+        f"{enough} it would add less to chi2 than chance. Simulations may end at lmax: then use "
+        "noise.above_lmax.treatment=ignored."
     )
 
 

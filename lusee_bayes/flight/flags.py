@@ -218,8 +218,7 @@ def comb_strength(autos: Autos, frames: Rows, averaging: Averaging, middles_mhz:
     # a single strong line is no comb
     clipped = np.clip(np.where(finite, z, 0.0), -COMB_LIMIT, COMB_LIMIT)
     strength = clipped.sum(axis=2) / np.sqrt(np.maximum(finite.sum(axis=2), 1))
-    most = np.abs(strength).argmax(axis=1)
-    return np.take_along_axis(strength, most[:, None], axis=1)[:, 0]
+    return np.take_along_axis(strength, np.abs(strength).argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
 def line_flags(

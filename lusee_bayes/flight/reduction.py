@@ -58,8 +58,7 @@ def reduce_sessions(
         If clocks, sites or times are unknown or contradict each other, a session lacks telemetry,
         or bands have too few channels.
     """
-    stages = stages or Stages()
-    line = timeline(sessions, recipe)
+    stages, line = stages or Stages(), timeline(sessions, recipe)
     level = np.concatenate([s.level for s in line.sessions])
     first = np.searchsorted(line.bin_of, np.arange(line.bin_of[-1] + 1))
     live_s, times = line.observation.live_s, line.observation.times

@@ -340,5 +340,4 @@ def _drawn_stretches(generator: np.random.Generator, n: int, share: float, lengt
     """Stretches of spectra, about this share of all."""
     if share == 0.0:
         return np.zeros(n, dtype=bool)
-    starts = generator.uniform(size=n) < share / length
-    return np.convolve(starts, np.ones(length))[:n] > 0.0
+    return np.convolve(generator.uniform(size=n) < share / length, np.ones(length))[:n] > 0.0

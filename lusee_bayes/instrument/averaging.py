@@ -155,8 +155,7 @@ def _series(importance: Importance, n_moments: int, largest: float) -> Series:
     """(i m)^k / k! for scaled moments, real and imaginary parts, weighted by their importance."""
     angle = 1j * np.arange(importance.shape[1]) * largest
     terms = np.array([angle**k / factorial(k) for k in range(n_moments)])
-    parts = np.stack([terms.real, terms.imag], axis=-1)
-    blocks = importance[:, None, :, None] * parts
+    blocks = importance[:, None, :, None] * np.stack([terms.real, terms.imag], axis=-1)
     return block_diag(*blocks.reshape(len(blocks), n_moments, -1))
 
 

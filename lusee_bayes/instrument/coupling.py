@@ -472,8 +472,7 @@ class CouplingMatrix(Coupling):
         xp = namespace(self, sky)
         zero_order = np.arange(self.lmax + 1)[None] == 0
         crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
-        both = xp.stack([pairs.T, crossed.T], axis=-1)
-        grids = []
+        both, grids = xp.stack([pairs.T, crossed.T], axis=-1), []
         for run, part in self._parts():
             x_and_y = self.by_order[run] @ both
             cosine, sine = _phases(self.pointing.azimuth[part], self.lmax)

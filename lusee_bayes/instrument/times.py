@@ -343,8 +343,7 @@ class Windows(Described):
         middle, half = (self.start_s + self.end_s) / 2.0, (self.end_s - self.start_s) / 2.0
         offset = middle[:, None] + half[:, None] * x
         share = self.live_s / self.live_per_sample_s[self.sample]
-        weight = share[:, None] * (w / 2.0)
-        return np.repeat(self.sample, n), offset.ravel(), weight.ravel()
+        return np.repeat(self.sample, n), offset.ravel(), (share[:, None] * (w / 2.0)).ravel()
 
 
 Timestamp = Literal["start", "middle", "end", "instant"]

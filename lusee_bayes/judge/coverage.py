@@ -125,8 +125,7 @@ def _statistics(
     size: Pulls, inside: Bool[np.ndarray, "n parts"]
 ) -> Float[np.ndarray, "parts statistics skies"]:
     weights = inside / inside.sum(axis=0)
-    limits = special.ndtri(0.5 + 0.5 * np.array(LEVELS))
-    held = [(size < limit) @ weights for limit in limits]
+    held = [(size < limit) @ weights for limit in special.ndtri(0.5 + 0.5 * np.array(LEVELS))]
     largest = [size.take(np.flatnonzero(part), axis=1).max(axis=1) for part in inside.T]
     return np.stack([*held, np.sqrt(size**2 @ weights), np.transpose(largest)]).transpose(2, 0, 1)
 

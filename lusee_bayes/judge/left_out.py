@@ -444,8 +444,7 @@ class LeftOut:
             templates = self._t[times].reshape(len(times), -1)
             templates = templates / np.maximum(np.abs(templates).max(axis=0), 1e-300)
             features = [self._model.coupling.time_features(times), templates]
-            starts = self._model.coupling.pointing.run_starts
-            run = np.searchsorted(starts, times, side="right")
+            run = np.searchsorted(self._model.coupling.pointing.run_starts, times, side="right")
             few, factors = linalg.spanning_rows(np.concatenate(features, axis=1), run)
             self._spans[key] = Span(times[few], factors)
         return self._spans[key]
@@ -487,8 +486,7 @@ class LeftOut:
         lower = linalg.cholesky(np.eye(len(w)) - w @ w.T, overwrite=True)
         solved = linalg.solve_lower(lower, np.column_stack([inside, with_sky]), transpose=False)
         chi2, directions = (float((x**2).sum()) for x in (solved[:, 0], solved[:, 1:]))
-        outside = float((chosen.b**2).sum() - (inside**2).sum())
-        return outside + chi2, directions
+        return float((chosen.b**2).sum() - (inside**2).sum()) + chi2, directions
 
     # --- groups that are removed from Q -------------------------------------------------------
 

@@ -116,8 +116,7 @@ def correlation(mean: Modes, truth: Modes) -> Ells:
     (ells,) array
         rho_ell; NaN where either map has no power.
     """
-    power = np.sqrt(sum_over_m(mean**2) * sum_over_m(truth**2))
-    return _ratio(sum_over_m(mean * truth), power)
+    return _ratio(sum_over_m(mean * truth), np.sqrt(sum_over_m(mean**2) * sum_over_m(truth**2)))
 
 
 def signal_to_noise(mean: Modes, truth: Modes) -> Ells:

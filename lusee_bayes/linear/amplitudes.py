@@ -490,8 +490,7 @@ def tie(
     root = blocks.reshape(n_channels * n, -1)
     inverse = np.linalg.inv(covariance)
     pulled = np.einsum("kij,kjw->kiw", inverse - np.eye(n), blocks)
-    precision = np.eye(root.shape[1]) + root.T @ pulled.reshape(root.shape)
-    lower = np.linalg.cholesky(precision)
+    lower = np.linalg.cholesky(np.eye(root.shape[1]) + root.T @ pulled.reshape(root.shape))
     white, z = np.zeros(root.shape[1]), np.zeros(mean.shape)
     for _ in range(1 + REFINEMENTS):
         pull = np.einsum("kij,kj->ki", inverse, mean - z) + z

@@ -304,6 +304,32 @@ def common_covariance(prior: SpectralPrior, channel: int, covariances: Blocks) -
     return whole
 
 
+def slopes(
+    prior: SpectralPrior, channel: int, information: Information, rows: Float[Array, "rows modes"]
+) -> Float[np.ndarray, "rows unknowns"]:
+    """Derivatives of linear functions of a channel's sky by all unknowns.
+
+    Parameters
+    ----------
+    prior : SpectralPrior
+        Of all channels.
+    channel : int
+        Number of the channel in the prior.
+    information : Information
+        Of the channel's data.
+    rows : (rows, modes) array
+        The linear functions.
+    """
+    n, root = n_modes(prior.lmax), on_host(prior.residual_root(channel))
+    seen, shared = rows, np.zeros((len(rows), information.n_modes - n))
+    if root is not None:
+        lower = residual_lower(information, root)
+        half = linalg.solve_lower(lower, (rows * root).T, transpose=False)
+        back = linalg.solve_lower(lower, half, transpose=True).T
+        seen, shared = back / root, -(root * back) @ information.matrix[:n, n:]
+    return np.concatenate([*(w * seen for w in on_host(prior.mixing)[channel]), shared], axis=1)
+
+
 class ChannelSky(eqx.Module):
     """The posterior of one channel's sky and the shared unknowns, given all data.
 

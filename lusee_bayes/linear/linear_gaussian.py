@@ -298,8 +298,7 @@ class Solution(Described):
     def chi2(self) -> float:
         """chi^2 of the data under the model: (d - E[d])^T (A S A^T + N)^-1 (d - E[d])."""
         white = self.factor.whiten(self.data - self.model.predict(self.posterior.mean))
-        misfit = white @ white
-        return float(misfit + self.posterior.prior_chi2()) - self.excess
+        return float(white @ white + self.posterior.prior_chi2()) - self.excess
 
     def weighted_residual(self) -> DataVector:
         """Compute N^-1 (d - offset - A m), where m is the posterior mean of the sky.
@@ -536,8 +535,7 @@ class Whitened(Form):
                 f"still changes by {float(moved):.2g} standard deviations (accepted: "
                 f"{CONVERGENCE:g}); the noise is too small for float64 arithmetic"
             )
-        prior = self.model.prior
-        posterior = Posterior(prior, u, self.lower, self.basis, log_evidence, moved)
+        posterior = Posterior(self.model.prior, u, self.lower, self.basis, log_evidence, moved)
         parts = self.model, data, posterior, self.factor
         # if the evidence is differentiated outside of jit, the last step alone is not traced
         traced = is_traced(*jax.tree.leaves(parts))

@@ -141,8 +141,7 @@ def diffuse_part(skies: PositiveSkies, channel: int, information: Information) -
 def _whole(skies: PositiveSkies, channel: int, exponent: np.ndarray) -> np.ndarray:
     """The sky of an exponent, in K, and the shared unknowns."""
     n = skies.n_fields
-    sky = skies.modes(channel, exponent[..., :n])
-    return np.concatenate([sky, exponent[..., n:]], axis=-1)
+    return np.concatenate([skies.modes(channel, exponent[..., :n]), exponent[..., n:]], axis=-1)
 
 
 def _slope(skies: PositiveSkies, channel: int, exponent: Vector) -> np.ndarray:

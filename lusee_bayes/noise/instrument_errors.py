@@ -322,5 +322,4 @@ def rms_difference(true: ProductBeams, model: ProductBeams) -> float:
 
     Computed over products and directions, by Parseval's theorem from the coefficients up to lmax.
     """
-    error = difference(true, model).modes
-    return float(jnp.sqrt((error**2).sum() / (model.modes**2).sum()))
+    return float(jnp.sqrt((difference(true, model).modes ** 2).sum() / (model.modes**2).sum()))

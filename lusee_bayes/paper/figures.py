@@ -146,8 +146,7 @@ def by_scenario(cases: Cases, metric: str) -> Figure:
 def scenario_maps(cases: Cases) -> Figure:
     """Figure 9: the true sky at 25 MHz and the map of every scenario, in the same colours."""
     truth = drawn(cases["fiducial"], "truth")
-    norm = drawing.temperatures(truth)
-    shown = [("truth", truth, None)]
+    norm, shown = drawing.temperatures(truth), [("truth", truth, None)]
     for name in MAP_CASES:
         case = TABLE[name]
         title = f"{case['group']}: {case['label']}" if "group" in case else name

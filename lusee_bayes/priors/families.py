@@ -46,8 +46,7 @@ SPACING = 0.5 * np.log(2.0)
 # Diffuse Galactic emission falls as ell^-2.4 to ell^-3.1 (La Porta et al. 2008, A&A 479, 641), with
 # little curvature. The hyperprior's tails leave room for skies that are unlike it.
 TILT, TILT_WIDTH = -2.7, 0.2
-CURVATURE_WIDTH = 0.3
-DEPARTURE_WIDTH = 0.15
+CURVATURE_WIDTH, DEPARTURE_WIDTH = 0.3, 0.15
 # standard deviation of ln C at the pivot: nearly unconstrained
 LOG_AMPLITUDE_WIDTH = 6.0
 # standard deviation of ln C_0, which does not follow the spectrum's form
@@ -119,8 +118,7 @@ class Hyperprior:
         """
         z, t = self._parts(parameters)
         theta = (FREEDOM + 1.0) / (FREEDOM + z**2) / self.width**2
-        cells = TAIL * STEEPNESS * np.exp(-STEEPNESS * t)
-        return np.concatenate([theta, cells])
+        return np.concatenate([theta, TAIL * STEEPNESS * np.exp(-STEEPNESS * t)])
 
     def scores(self, parameters: Parameters) -> Parameters:
         """Compute the standard normal score z of each: Phi(z) = P(parameter is smaller)."""

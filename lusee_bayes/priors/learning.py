@@ -390,8 +390,7 @@ def _learned(
         once, twice = (family.averaged(mean + level * first, about) for level in (0.0, np.log(2.0)))
 
     def at_level(shift: float) -> Posterior:
-        covariance = once + np.expm1(shift) * (twice - once)
-        return information.posterior(family.prior(covariance))
+        return information.posterior(family.prior(once + np.expm1(shift) * (twice - once)))
 
     tried = [float(at_level(shift).log_evidence) for shift in LEVELS]
     square, linear, _ = np.polyfit(LEVELS, tried, 2)

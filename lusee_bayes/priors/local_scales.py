@@ -114,8 +114,7 @@ class Band:
         near, weight = healpy.get_interp_weights(CELLS_NSIDE, theta, phi)
         at = np.tile(np.arange(len(theta)), 4)
         cells = sparse.csr_array((weight.ravel(), (at, near.ravel())), (len(theta), N_CELLS))
-        x = np.log((_middle(window) + 1.0) / PIVOT)
-        tilts = x * np.column_stack([seen, plane])
+        tilts = np.log((_middle(window) + 1.0) / PIVOT) * np.column_stack([seen, plane])
         covariates = np.column_stack([seen, clear - seen, plane, tilts, field])
         return cls(window, grid, covariates, cells)
 
@@ -168,8 +167,7 @@ def _discs(lmax: int) -> Float[np.ndarray, "discs modes"]:
     directions = healpy.pix2ang(DISCS_NSIDE, np.arange(12 * DISCS_NSIDE**2))
     fwhm = np.radians(DISC_DEG)
     area = 2.0 * np.pi * fwhm**2 / (8.0 * np.log(2.0))
-    profile = per_mode(healpy.gauss_beam(fwhm, lmax))
-    return area * profile * synthesis_matrix(*directions, lmax)
+    return area * per_mode(healpy.gauss_beam(fwhm, lmax)) * synthesis_matrix(*directions, lmax)
 
 
 def hyperprior_of(centre: Parameters, width: Parameters, n_discs: int) -> Hyperprior:

@@ -27,8 +27,7 @@ KERNEL_NSIDE = 64
 # largest multipole of point-spread functions: a page with more would be too large
 LARGEST_ELL = 47
 # largest size of all pixels in bytes, before base64; two bytes per number
-BUDGET = 3_500_000
-LEVELS = 65535
+BUDGET, LEVELS = 3_500_000, 65535
 
 Maps = Float[np.ndarray, "channels pixels"]
 

@@ -8,6 +8,7 @@ data or those of all channels.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -352,7 +353,7 @@ def channel_result(
     *,
     pixels: Pixels | None = None,
     instrument: Unknowns | None = None,
-    common: Columns | None = None,
+    common: Callable[[np.ndarray], np.ndarray] | None = None,
     joint: Float[np.ndarray, "all modes"] | None = None,
     covariance_kept: bool = False,
     information_bits: float = np.nan,
@@ -372,8 +373,8 @@ def channel_result(
         Standard deviations of pixels in K; computed if omitted.
     instrument : Unknowns, optional
         Unknowns of the instrument given the sky, where the model has them.
-    common : (modes + sources, white) array, optional
-        Root of the covariance with other channels, as of :class:`.RegionTemperatures`.
+    common : callable, optional
+        Gives the covariance with other channels, as of :meth:`.RegionTemperatures.of`.
     joint : (all, modes) array, optional
         Draws of the sky in a posterior of all channels, in K.
     covariance_kept : bool

@@ -187,8 +187,7 @@ def _observed(channels: Sequence[ChannelResult], axis: dict) -> dict[str, xr.Dat
         grid = (("product", "time"), channel.data, {"units": "K"})
         angle = ("time", channel.turntable_deg, {"units": "degree"})
         parts.append(xr.Dataset({"visibility": grid, "turntable_deg": angle}, coords))
-    along = xr.Variable(*axis["frequency"]).to_index_variable()
-    whole = xr.concat(parts, along, join="outer")
+    whole = xr.concat(parts, xr.Variable(*axis["frequency"]).to_index_variable(), join="outer")
     return {"observed_data": whole[["visibility"]], "constant_data": whole[["turntable_deg"]]}
 
 
@@ -277,7 +276,7 @@ def read_information(path: Path, channel: Scenario) -> SavedInformation:
         if name not in kept.children:
             raise InputError(
                 f"{path} is for {', '.join(kept.children)} MHz, the scenario for {name} MHz; use "
-                f"--set frequency_mhz={next(iter(kept.children))}"
+                "its frequencies, or map without --add"
             )
         saved = from_tree(SavedInformation, kept.children[name], str(path))
     if saved.information.n_modes != n_modes(channel.lmax):
@@ -507,6 +506,8 @@ def evidence_caveat(runs: Sequence[FinishedRun]) -> str | None:
 def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
     """How the data of a run differ from those of the first, in words; None if they agree."""
     ours, theirs = (one.channel.data for one in (first, run))
+    if first.channel.digests[:-1] != run.channel.digests[:-1]:
+        return "was added to other earlier data (--add), or to none"
     frequencies = [one.channel.frequency_mhz for one in (first, run)]
     if frequencies[0] != frequencies[1]:
         return f"is at {frequencies[1]:g} MHz instead of {frequencies[0]:g}"

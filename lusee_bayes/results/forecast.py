@@ -87,9 +87,13 @@ def forecast_lines(forecasts: Sequence[Forecast]) -> list[str]:
         text += f"; most: {best.variation.family}, {best.variation.name}: +{more:.0f} bits"
     offsets = first.offsets_line()
     lines = [text, f"{source}: {offsets}"] if offsets else [text]
+    if first.variation.scenario.prior.is_learned:
+        lines.append(
+            f"{source}: with the expected prior; a map, which learns it, may differ by 40 %"
+        )
     return lines + [
         f"{source}, {one.variation.name}: residual chi2 would not reveal errors up to these (in "
-        f"brackets, the resulting error of the map, in standard deviations): {one.unnoticed}"
+        f"brackets, the map's error in standard deviations, rms over directions): {one.unnoticed}"
         for one in forecasts
         if one.unnoticed
     ]

@@ -26,6 +26,8 @@ from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.systematics.systematic import SKY
 
 SAMPLES, CHAINS = "samples.nc", "chains"
+# longest site whose elements are quantities, too
+LISTED = 20
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,13 @@ class SampleResult:
         return self.tree["posterior"][SKY].values
 
     def quantities(self) -> dict[str, np.ndarray]:
-        """Draws (chains, draws) of scalar sites, landmarks, powers and lowest modes."""
+        """Draws (chains, draws) of sites with few elements, landmarks, powers and lowest modes."""
         lmax = self.experiment.scenario.lmax
         sites = self.tree["posterior"].data_vars.items()
         others = {name: x.values for name, x in sites if name != SKY and x.ndim == 2}
+        for name, x in sites:
+            if name != SKY and x.ndim == 3 and x.shape[2] <= LISTED:
+                others |= {f"{name}[{k}]": x.values[..., k] for k in range(x.shape[2])}
         ells = sorted({min(ell, lmax) for ell in (0, 1, 2, 5, 10, 20, 30, 40)})
         modes = [(ell, m) for ell in range(min(lmax, 2) + 1) for m in range(-ell, ell + 1)]
         return others | mode.sky_quantities(self.skies, pixels=LANDMARKS, ells=ells, modes=modes)

@@ -11,17 +11,21 @@ W_f = Cov(m_f, z_f) Cov(z_f)^-1 R_f per unit of w.
 Channels are solved with independent priors m = mu + G u, u ~ N(0, 1), but their skies are alike.
 Given z, with the covariance C_z, the error of m contains -E u with E = C_z G^-T: the structure that
 the data do not measure, which is nearly the same at all frequencies. rho_fg, the correlation of u
-at f and g, is measured: it is that of the posterior means of u, which vanish where data measure
-nothing. Both terms are at most the whole variance, so the matrix is positive definite.
+at f and g, is measured: it is the product of the posterior means u', each divided by the root of
+u' K u', with the fraction K = 1 - G^-1 C G^-T that the data measure. Both terms are at most the
+whole variance, so the matrix is positive definite.
 
-In a joint posterior the prior correlates the skies: the correlation of channels is that of draws.
+In a joint posterior the prior correlates the skies. L m_f is linear in the component maps and the
+shared unknowns x, with the slope W_f (:func:`.joint.slopes`), and the rest is independent of other
+channels: the covariance is W_f Cov(x) W_g^T. That of positive skies is estimated from draws, times
+the factor that makes the mean of its inverse right (Hartlap et al. 2007, A&A 464, 399).
 Parameters of a learned prior have their most probable values.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -34,6 +38,7 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import averaging_rows, lmax_of, per_mode, pixel_matrix, taper
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER, WHOLE_SKY, Fluxes
 from lusee_bayes.judge.chi2 import ChiSquare
@@ -51,8 +56,9 @@ NSIDE = 64
 REGIONS = "mean sky", "observed sky", "cap b > 60", "cap b < -60", "plane |b| < 10"
 OBSERVED = REGIONS[1]
 UNOBSERVED, UNMEASURED = "unobserved sky", "unmeasured structure"
-# draws of a joint posterior that the correlation of its channels is computed from
+# draws of a joint posterior, from which covariances of positive skies are computed
 N_DRAWS = 400
+TINY = np.finfo(np.float64).tiny
 # resolution of maps of the spectral index, and number of draws behind them
 INDEX_NSIDE, INDEX_DRAWS = 8, 100
 # a value is defined where at least this fraction of the draws has it
@@ -81,7 +87,8 @@ class Departure:
     Attributes
     ----------
     mean : (white,) array
-        Posterior mean of u, the sky's departure from the prior in prior standard deviations.
+        Posterior mean of u, the sky's departure from the prior in prior standard deviations, such
+        that products of two channels are the correlation of their skies.
     error : (regions + sources, white) array
         L E: how each region's temperature misses u, and the temperature of each point source.
     """
@@ -109,7 +116,9 @@ class Departure:
         n, inside = len(mean), np.stack([*sky_regions(highest_altitude).values()])
         rows = block_diag(averaging_rows(inside, lmax_of(n)), np.eye(len(w) - n))
         error = np.asarray(prior.whiten(rows @ covariance - (rows @ w) @ w[:n].T))
-        return cls(np.asarray(prior.whiten(mean) - prior.white_mean), error)
+        u = np.asarray(prior.whiten(mean) - prior.white_mean)
+        v = np.asarray(prior.whiten_columns(u[None]))[0]
+        return cls(u / np.sqrt(u @ u - v @ covariance[:n] @ v), error)
 
 
 @dataclass(frozen=True)
@@ -123,10 +132,11 @@ class RegionTemperatures:
     mean, std : (regions,) array
     truth : (regions,) array or None
     common : (regions, shared) array
-        L W: change per unit of the shared unknowns.
+        L W: change per unit of the shared unknowns; before channels are combined, of all unknowns
+        of a joint posterior.
     shares : (sources, regions) array
         Fraction of each variance that would vanish if an unknown were known: a systematic, or the
-        sky that never rises; and the fraction from E u. The fractions need not add up.
+        mean of the sky that never rises; and the fraction from E u. The fractions need not add up.
     draws : (draws, regions) array
         Of a joint posterior; empty otherwise.
     cells : (draws, pixels) array or None
@@ -153,7 +163,7 @@ class RegionTemperatures:
         *,
         truth: Modes | None = None,
         roots: Mapping[str, Float[np.ndarray, "mode kept"]],
-        common: Columns | None = None,
+        common: Callable[[WithSky], np.ndarray] | None = None,
         departure: Departure | None = None,
         draws: Float[np.ndarray, "draw mode"] | None = None,
         fluxes: Fluxes | None = None,
@@ -170,8 +180,8 @@ class RegionTemperatures:
         roots : mapping of (modes + sources, kept) arrays
             For each systematic, R of the part R R^T of the covariance that would vanish if it were
             known.
-        common : (modes + sources, shared) array, optional
-            W.
+        common : callable, optional
+            L W from L.
         departure : Departure, optional
         draws : (draws, modes) array, optional
             Of a joint posterior.
@@ -180,17 +190,14 @@ class RegionTemperatures:
         """
         regions, n = sky_regions(highest_altitude), len(mean)
         inside, lmax = np.stack([*regions.values()]), lmax_of(n)
-        rows, never = averaging_rows(inside, lmax), inside & ~regions[OBSERVED]
-        hidden = (never.sum(1) / inside.sum(1))[:, None] * averaging_rows(never, lmax)
+        rows, hidden = averaging_rows(inside, lmax), averaging_rows(~inside[1:2], lmax)[0]
         fluxes = fluxes or Fluxes((), *[np.zeros(0)] * 3, np.zeros((0, n)), np.zeros((n, 0)))
 
-        def variance(rows: Rows) -> Float[np.ndarray, " area"]:
-            return np.einsum("rm,rm->r", rows @ covariance, rows)
-
         both = block_diag(rows, np.eye(len(fluxes.names)))
-        std = np.append(np.sqrt(variance(rows)), fluxes.std)
+        std = np.append(np.sqrt(np.einsum("rm,rm->r", rows @ covariance, rows)), fluxes.std)
         parts = {name: ((both @ root[: both.shape[1]]) ** 2).sum(1) for name, root in roots.items()}
-        parts[UNOBSERVED] = np.append(variance(hidden), 0.0 * fluxes.std)
+        of_hidden = np.append(rows @ covariance @ hidden, fluxes.with_sky @ hidden)
+        parts[UNOBSERVED] = of_hidden**2 / max(hidden @ covariance @ hidden, TINY)
         if departure is not None:
             parts[UNMEASURED] = (departure.error**2).sum(1)
         return cls(
@@ -199,11 +206,31 @@ class RegionTemperatures:
             np.append(rows @ mean, fluxes.mean),
             std,
             None if truth is None else np.append(rows @ truth, fluxes.truth),
-            np.zeros((len(std), 0)) if common is None else both @ common,
+            np.zeros((len(std), 0)) if common is None else common(both),
             np.stack([*parts.values()]) / std**2,
             np.zeros((0, len(std))) if draws is None else draws @ rows.T,
             None if draws is None else draws[:INDEX_DRAWS] @ _cell_rows(lmax).T,
         )
+
+
+def _correlation(u: Float[np.ndarray, "frequency white"]) -> Float[np.ndarray, "frequency _"]:
+    """Products of departures; noise that exceeds what correlations can be is cut off."""
+    alike = np.minimum(u @ u.T, 1.0)
+    np.fill_diagonal(alike, 1.0)
+    values, vectors = np.linalg.eigh(alike)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root /= np.linalg.norm(root, axis=1, keepdims=True)
+    return root @ root.T
+
+
+def combined(
+    channels: Sequence[RegionTemperatures], posterior: Posterior
+) -> list[RegionTemperatures]:
+    """Replace slopes by all unknowns by a root of the covariance that these cause."""
+    slopes = np.concatenate([channel.common for channel in channels])
+    white = solve_lower(posterior.lower, posterior.prior.colour_columns(slopes).T, transpose=False)
+    common = np.split(np.linalg.qr(white, mode="r").T, len(channels))
+    return [replace(one, common=part) for one, part in zip(channels, common, strict=True)]
 
 
 @lru_cache(maxsize=1)
@@ -245,16 +272,18 @@ class SkySpectrum:
         frequencies_mhz, channels, departures = zip(*each, strict=True)
         first = channels[0]
         std, common = np.stack([c.std for c in channels]), np.stack([c.common for c in channels])
-        if len(first.draws):
+        n_draws, n = len(first.draws), len(channels)
+        if n_draws and not common.size:
             drawn = np.stack([c.draws.T for c in channels], axis=1)
-            correlation = np.stack([np.atleast_2d(np.corrcoef(of_region)) for of_region in drawn])
-            covariance = correlation * np.einsum("fr,gr->rfg", std, std)
+            covariance = np.stack([np.atleast_2d(np.cov(of_region)) for of_region in drawn])
+            covariance *= (n_draws - 1.0) / max(n_draws - n - 2.0, 1.0)
         else:
-            errors = np.stack([one.error for one in departures])
             covariance = np.einsum("frw,grw->rfg", common, common)
-            u = np.stack([one.mean / np.linalg.norm(one.mean) for one in departures])
-            covariance += u @ u.T * np.einsum("frw,grw->rfg", errors, errors)
-            covariance[:, *np.diag_indices(len(channels))] = std.T**2
+            if not n_draws:
+                errors = np.stack([one.error for one in departures])
+                alike = _correlation(np.stack([one.mean for one in departures]))
+                covariance += alike * np.einsum("frw,grw->rfg", errors, errors)
+            covariance[:, *np.diag_indices(n)] = std.T**2
         # an unknown that a channel lacks takes no part in its errors
         sources = tuple(dict.fromkeys(name for one in channels for name in one.sources))
         shares = np.zeros((len(sources), len(first.regions), len(channels)))

@@ -58,11 +58,12 @@ from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
 from lusee_bayes.linear.amplitudes import Tied, kernel, tie
 from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
 from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
-from lusee_bayes.results.sky_spectrum import N_DRAWS
+from lusee_bayes.results.sky_spectrum import N_DRAWS, combined
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import identity_of
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -175,12 +176,13 @@ class ChannelInformation:
         n, key, n_draws = information.n_modes, draw_key(scenario), scenario.output.draws
         if tied is not None:
             information = unknowns.whole(information, tied, number)
-        draws, spread = components.draws, components.spread
+        draws, spread, common = components.draws, components.spread, None
         if (mode := components.mode) is not None:
             sky = positive_joint.positive_sky(mode, number, information, spread, draws, key)
         else:
             means = (components.mean, spread, draws)
             sky = joint.channel_sky(components.prior, number, information, *means, key)
+            common = partial(joint.slopes, components.prior, number, information)
         mean, covariance, drawn = sky.mean[:n], sky.covariance[:n, :n], sky.draws[:, :n]
         if tied is not None:
             unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
@@ -193,6 +195,7 @@ class ChannelInformation:
             draws=drawn[:n_draws],
             log_likelihood=information.log_likelihood(sky.draws[:n_draws]),
             instrument=unknowns,
+            common=common,
             joint=drawn,
             independent=np.asarray(self.information.reference),
             covariance_kept=scenario.output.covariance,
@@ -270,7 +273,7 @@ def names_of(channels: tuple[Scenario, ...]) -> str:
 
 def solve_components(
     scenario: Scenario, channels: ChannelsInFiles, seen: Sequence[Seen], n_draws: int
-) -> Components:
+) -> tuple[Components, Posterior]:
     """Compute the joint posterior of all channels.
 
     Parameters
@@ -314,7 +317,8 @@ def solve_components(
         spread = jax.block_until_ready(joint.paired(posterior.covariance(), prior))
         drawn = posterior.sample(draw_key(scenario), n_draws)
         figures = chi2, float(posterior.log_evidence), float(posterior.information_bits()), moved
-        return Components(prior, np.asarray(posterior.mean), spread, drawn, *figures, mode)
+        mean = np.asarray(posterior.mean)
+        return Components(prior, mean, spread, drawn, *figures, mode), posterior
 
 
 # folded into the random key of the draws; channel numbers are smaller
@@ -456,7 +460,7 @@ class ChannelAlone:
             draws=skies,
             log_likelihood=information.log_likelihood(skies),
             instrument=unknowns,
-            common=of_all @ tied.root[number, at],
+            common=lambda rows: rows @ (of_all @ tied.root[number, at]),
             **(self.figures | information.fit(moved, left) | {"information_bits": float(bits)}),
         )
 
@@ -641,7 +645,9 @@ def map_channels(
     if scenario.joint:
         at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
         n_draws = max(scenario.output.draws, N_DRAWS)
-        components = solve_components(_without(unmapped, scenario), at_hand, seen, n_draws)
+        components, posterior = solve_components(
+            _without(unmapped, scenario), at_hand, seen, n_draws
+        )
 
     def finish(channel: Scenario) -> None:
         """Write the result of a channel, given the data of all channels."""
@@ -651,9 +657,12 @@ def map_channels(
 
     if not alone:
         each(finish, mapped, "joint skies" if scenario.joint else "shared instrument")
-    results = tuple(files.read(channel, ChannelResult) for channel in mapped)
+    results = [files.read(channel, ChannelResult) for channel in mapped]
+    if components is not None and components.mode is None:
+        regions = combined([result.temperatures for result in results], posterior)
+        results = [replace(a, temperatures=b) for a, b in zip(results, regions, strict=True)]
     more = {"tie_log_evidence": 0.0 if tied is None else tied.log_evidence, "shared_tests": tests}
-    return MapResult(scenario, results, components, stages.seconds, unmapped, **more)
+    return MapResult(scenario, tuple(results), components, stages.seconds, unmapped, **more)
 
 
 def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:

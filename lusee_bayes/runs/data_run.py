@@ -391,11 +391,7 @@ def run_average(
             "name that does not end in .fits"
         )
     require_new(path, replace=replace, inputs=inputs_of(scenario, data))
-    if scenario.frequencies_mhz:
-        raise InputError(
-            "averages have one frequency; give a scenario with frequency_mhz and without "
-            "frequencies_mhz"
-        )
+    scenario.require_single("averages have")
     scenario = scenario.with_section("observation", average_s=None)
     with stages("data"):
         fine = read_data(data, scenario)

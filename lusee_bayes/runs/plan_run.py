@@ -355,6 +355,7 @@ def run_plan(
     scenarios = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
     for name, scenario in scenarios.items():
         with naming(name):
+            scenario.require_single("a forecast has")
             require_fits(posterior_cost(scenario), scenario)
     digests = {name: text_hash(s.to_yaml())[:12] for name, s in scenarios.items()}
     inputs = [path for scenario in scenarios.values() for path in inputs_of(scenario)]

@@ -44,7 +44,7 @@ from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sa
 from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program
-from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel
+from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel, site_in
 from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
 from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.registered import present
@@ -128,6 +128,12 @@ def sample_together(
         elif not several:
             given = arguments[first], experiments[first].data, inferences[first], latent[first]
             whitening = coordinates(program, *given)
+        else:
+            begin = [(name, start_values(one, latent[name])) for name, one in inferences.items()]
+            start = {site_in(name, n): v for name, values in begin for n, v in values.items()}
+            fixed = [site_in(name, n) for name in latent for n in SCALES]
+            mode = laplace_approximation(model, observed, start, fixed)
+            whitening = mode.whitening if bool(mode.converged) else None
     checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
     times = []
     with stages.progress("sampling", sampler.warmup + sampler.draws) as update:
@@ -433,9 +439,9 @@ def run_validate(
     InputError
         For too few draws or simulations, and as :func:`run_sample`.
     """
-    scenario = load_scenario(scenario)
-    stages = stages or Stages()
+    scenario, stages = load_scenario(scenario), stages or Stages()
     sampler = sampler or Sampler(seed=scenario.seed)
+    scenario.require_single("a validation has")
     program = programs.load_program("sky")
     require_simulations(simulations)
     require_draws(sampler.draws)

@@ -209,8 +209,9 @@ def _given(value: Float[Array, "..."], log_det: float | Float[Array, ""]) -> Cal
             raise InputError(f"the site '{name}' is observed; only latent sites can be whitened")
         transform = dist.biject_to(fn.support)
         site = transform(value)
-        density = log_det + transform.log_abs_det_jacobian(value, site).sum()
-        numpyro.factor(f"{name}_density", fn.log_prob(site).sum() + density)
+        each = fn.log_prob(site)  # in a plate, one of every element: a scalar would be repeated
+        more = log_det + transform.log_abs_det_jacobian(value, site).sum()
+        numpyro.factor(f"{name}_density", each + more / each.size)
         return None, site
 
     return reparametrised
@@ -666,8 +667,7 @@ class _Run:
             return state, {"z": state.z} | {name: of(state) for name, of in STATISTICS.items()}
 
         state, rows = jax.lax.scan(step, state, jnp.arange(CHUNK))
-        constrain = self.kernel.postprocess_fn((dynamic,), {})
-        sites = jax.vmap(jax.vmap(constrain))(rows.pop("z"))
+        sites = jax.vmap(jax.vmap(self.kernel.postprocess_fn((dynamic,), {})))(rows.pop("z"))
         sites = {n: values for n, values in sites.items() if not n.endswith(programs.WHITE_SUFFIX)}
         return state, sites | rows
 

@@ -6,9 +6,8 @@ from lusee_bayes.core.errors import InputError
 
 # number of bins of a rank histogram, and simulations expected in each
 N_BINS, PER_BIN = 20, 5
-
-
-LEAST_DRAWS = 100
+# draws of each chain, fewer of which cannot be as many independent ones as a comparison needs
+LEAST_DRAWS = 300
 
 
 def require_simulations(n: int) -> None:

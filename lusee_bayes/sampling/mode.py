@@ -160,8 +160,7 @@ def _root_of_any_sign(curvature: Matrix) -> tuple[Array, Array]:
     # in units of its diagonal, because parameters have any units
     scale = 1.0 / jnp.sqrt(jnp.abs(jnp.diagonal(curvature)))
     values, vectors = jnp.linalg.eigh(curvature * scale[:, None] * scale[None])
-    least = np.finfo(np.float64).eps * jnp.abs(values).max()
-    strength = jnp.maximum(jnp.abs(values), least)
+    strength = jnp.maximum(jnp.abs(values), np.finfo(np.float64).eps * jnp.abs(values).max())
     return scale[:, None] * vectors / jnp.sqrt(strength)[None], (values > 0).all()
 
 
@@ -492,8 +491,7 @@ def sky_quantities(
     InputError
         For modes and ells beyond lmax.
     """
-    lmax = lmax_of(skies.shape[-1])
-    columns = {}
+    lmax, columns = lmax_of(skies.shape[-1]), {}
     for name, (l_deg, b_deg) in (pixels or {}).items():
         theta, phi = np.radians([90.0 - b_deg]), np.radians([l_deg])
         columns[f"T({name}) [K]"] = skies @ synthesis_matrix(theta, phi, lmax)[0]

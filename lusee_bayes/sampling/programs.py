@@ -29,7 +29,7 @@ from numpyro import handlers
 from numpyro.infer import Predictive
 from numpyro.infer.util import log_density
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, on_device
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import read_text, require_file
@@ -262,7 +262,7 @@ def collapsed_draws(
 
     def model():
         gaussian = program.model(**arguments, data=jnp.asarray(data))
-        exact = gaussian.condition(data).posterior.sample(numpyro.prng_key())
+        exact = on_device(gaussian.condition(data).posterior).sample(numpyro.prng_key())
         sky = numpyro.sample("drawn sky", numpyro.distributions.Delta(exact, event_dim=1))
         replicated = gaussian.predict(sky) + gaussian.noise.sample(numpyro.prng_key())
         numpyro.deterministic("drawn data", replicated)

@@ -46,22 +46,15 @@ from lusee_bayes.core.lazy import coordinates, healpy
 
 Numbers = float | np.ndarray
 
-ELECTRON_TEMPERATURE_K = 8000.0
-SUN_RADIUS_KPC = 8.5
+ELECTRON_TEMPERATURE_K, SUN_RADIUS_KPC = 8000.0, 8.5
 
 # Densities, heights and radii are NE2001's (n1h1/h1, h1, A1; n2, h2, A2). The clumping factor
 # <n^2>/<n>^2 of the thick disc is tuned by hand against ULSA's mean at 1 MHz; it matches gas
 # filling 30 % of the volume (Gaensler et al. 2008, PASA 25, 184, find 4 to 30 %). For the thin disc
 # it is NE2001's F2; F1 = 0.18, meant for scattering, would leave 1 MHz four times too bright.
-THICK_DENSITY_CM3 = 0.034
-THICK_HEIGHT_KPC = 0.97
-THICK_EDGE_KPC = 17.5
-THICK_CLUMPING = 3.5
-THIN_DENSITY_CM3 = 0.08
-THIN_HEIGHT_KPC = 0.15
-THIN_RADIUS_KPC = 3.8
-THIN_WIDTH_KPC = 1.8
-THIN_CLUMPING = 120.0
+THICK_DENSITY_CM3, THICK_HEIGHT_KPC, THICK_EDGE_KPC, THICK_CLUMPING = 0.034, 0.97, 17.5, 3.5
+THIN_DENSITY_CM3, THIN_CLUMPING = 0.08, 120.0
+THIN_HEIGHT_KPC, THIN_RADIUS_KPC, THIN_WIDTH_KPC = 0.15, 3.8, 1.8
 
 
 def absorption_per_emission_measure(frequency_mhz: float) -> float:
@@ -370,26 +363,18 @@ BRIGHT_SOURCES = (
 
 
 # Synchrotron emissivity (Cong et al. 2021, constant spectral index).
-EMISSIVITY_K_PER_KPC = 43.10
-EMISSIVITY_CORE_KPC = 0.1
-EMISSIVITY_RADIUS_KPC = 3.41
-EMISSIVITY_RADIAL_INDEX = 0.46
-EMISSIVITY_HEIGHT_KPC = 1.12
-EMISSIVITY_HEIGHT_INDEX = 1.23
-SPECTRAL_INDEX = -2.51
-REFERENCE_MHZ = 408.0
+EMISSIVITY_K_PER_KPC, EMISSIVITY_CORE_KPC = 43.10, 0.1
+EMISSIVITY_RADIUS_KPC, EMISSIVITY_RADIAL_INDEX = 3.41, 0.46
+EMISSIVITY_HEIGHT_KPC, EMISSIVITY_HEIGHT_INDEX = 1.12, 1.23
+SPECTRAL_INDEX, REFERENCE_MHZ = -2.51, 408.0
 
 # Extragalactic background (Seiffert et al. 2011, ApJ 734, 6).
-BACKGROUND_K = 1.2
-BACKGROUND_REFERENCE_MHZ = 1000.0
-BACKGROUND_INDEX = -2.58
+BACKGROUND_K, BACKGROUND_REFERENCE_MHZ, BACKGROUND_INDEX = 1.2, 1000.0, -2.58
 
 # Random component: rms of ln(synchrotron emission) over 2 <= ell <= FLUCTUATION_LMAX and the slope
 # of its C_ell, as for Galactic synchrotron (La Porta et al. 2008, A&A 479, 641). The rms is tuned:
 # the largest that keeps ULSA's contrast between odd and even multipoles at 10 MHz.
-FLUCTUATION_RMS = 0.05
-FLUCTUATION_SLOPE = -2.7
-FLUCTUATION_LMAX = 191
+FLUCTUATION_RMS, FLUCTUATION_SLOPE, FLUCTUATION_LMAX = 0.05, -2.7, 191
 
 # Spurs: parts of shells, besides loops I to IV, that are brighter by up to this share. Clouds of
 # ionised gas within some 300 pc, in front of most of the emission: FWHM in degrees, scale height of
@@ -402,12 +387,10 @@ CLOUD_EMISSION_MEASURE, CLOUD_SCATTER, CLOUD_COVERED = 30.0, 0.8, (0.3, 1.0)
 # et al. 2007, AJ 134, 1245), N(> S) ~ S^-1.5, S ~ nu^-0.7. The brightest are in the catalogue
 N_FAINT, FAINT_JY, FAINT_MHZ, FAINT_INDEX = 2300, (10.0, 200.0), 25.0, -0.7
 
-MINIMUM_MHZ = 1.0
-MAXIMUM_MHZ = 50.0
+MINIMUM_MHZ, MAXIMUM_MHZ = 1.0, 50.0
 
 # Lines of sight end 50 kpc away (Cong et al.) or 10 kpc above the plane, where exp(-15) remains.
-DEPTH_KPC = 50.0
-TOP_KPC = 10.0
+DEPTH_KPC, TOP_KPC = 50.0, 10.0
 
 
 def emissivity(radius_kpc: np.ndarray, z_kpc: np.ndarray) -> np.ndarray:
@@ -538,8 +521,7 @@ def brightness(synchrotron: np.ndarray, depth: np.ndarray, frequency_mhz: float)
         Frequency in MHz.
     """
     behind = background(frequency_mhz) * np.exp(-depth)
-    thermal = -ELECTRON_TEMPERATURE_K * np.expm1(-depth)
-    return synchrotron + thermal + behind
+    return synchrotron - ELECTRON_TEMPERATURE_K * np.expm1(-depth) + behind
 
 
 def _synchrotron(frequency_mhz: float, theta: Vector, phi: Vector) -> tuple[Vector, Vector]:
@@ -629,8 +611,7 @@ class Structures:
         least, most = np.array(FAINT_JY) ** -1.5
         flux = rng.uniform(most, least, N_FAINT) ** (-1.0 / 1.5)
         at = healpy.vec2pix(nside, *rng.standard_normal((3, N_FAINT)))
-        faint = np.bincount(at, flux, 12 * nside**2)
-        return cls(emission, np.array(clouds), covered, faint)
+        return cls(emission, np.array(clouds), covered, np.bincount(at, flux, 12 * nside**2))
 
 
 def _seen_from(one: ExtendedObject, l_deg: Vector, b_deg: Vector) -> tuple[Vector, Vector]:

@@ -52,8 +52,7 @@ NEWTON, REACH = 30, 2.0
 
 def slopes(lmax: int) -> Float[np.ndarray, "2 ells"]:
     """Return the derivatives of ln C_ell^(1/2) with respect to ln A and the tilt."""
-    ell = np.arange(lmax + 1.0)
-    return np.stack([np.ones(lmax + 1), 0.5 * np.log((ell + 1.0) / PIVOT)])
+    return np.stack([np.ones(lmax + 1), 0.5 * np.log((np.arange(lmax + 1.0) + 1.0) / PIVOT)])
 
 
 def matching_step(

@@ -245,8 +245,7 @@ class Setup:
         """Whether every port that was used has its auto at some time."""
         seen, n = np.asarray(self.layout.present).any(1), self.beam_source.n_ports
         first, second, _ = ports(n)
-        used = np.union1d(first[seen], second[seen])
-        return bool(seen[auto_indices(n)[used]].all())
+        return bool(seen[auto_indices(n)[np.union1d(first[seen], second[seen])]].all())
 
 
 def prior_and_family(scenario: Any, sky: Sky) -> tuple[Prior, PriorFamily | None]:

@@ -170,8 +170,7 @@ class PointingOffsets(Systematic):
 
     def effect(self, model, values):
         """Use A with the offsets; sources with their mean fluxes move, too."""
-        pointing = self.turned(values)
-        model = replace(model, coupling=model.coupling.of(pointing=pointing))
+        model = replace(model, coupling=model.coupling.of(pointing=self.turned(values)))
         if self.sources is None:
             return model
         seen = self.sources.seen(self.orientation(values), self.layout)
@@ -194,8 +193,7 @@ class PointingOffsets(Systematic):
         for axis in range(3):
             blocks = (generators(ell)[axis] for ell in range(model.coupling.lmax + 1))
             beams.append(Rotation(tuple(blocks))(np.asarray(model.coupling.modes)))
-            w = turn[:, (axis + 2) % 3, (axis + 1) % 3]
-            ways.append(w[np.asarray(self.layout.time)])
+            ways.append(turn[:, (axis + 2) % 3, (axis + 1) % 3][np.asarray(self.layout.time)])
         see = model.coupling.along(beams, pointing)
 
         def columns(sky):

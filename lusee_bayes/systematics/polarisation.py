@@ -175,5 +175,4 @@ def linear_modes(fields: AntennaFields, lmax: int) -> tuple[Modes, Modes]:
     def summed(pattern: Array, polar: Array, orders: Array) -> Modes:
         return np.einsum("ktc,tc->kc", pattern[..., lmax + orders], polar)
 
-    e = summed(q, even, m) + summed(u, odd, -m)
-    return e, summed(u, even, m) - summed(q, odd, -m)
+    return summed(q, even, m) + summed(u, odd, -m), summed(u, even, m) - summed(q, odd, -m)

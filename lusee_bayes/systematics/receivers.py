@@ -120,5 +120,4 @@ def _smooth_spectra(key: PRNGKeyArray, n_ports: int, x: float) -> Float[np.ndarr
     any w.
     """
     waves, cosines, sines = np.asarray(jax.random.normal(key, (3, n_ports, N_WAVES)))
-    values = cosines * np.cos(waves * x) + sines * np.sin(waves * x)
-    return values.sum(1) / np.sqrt(N_WAVES)
+    return (cosines * np.cos(waves * x) + sines * np.sin(waves * x)).sum(1) / np.sqrt(N_WAVES)

@@ -93,8 +93,7 @@ class SourceSection(Section):
         """Number of the amplitude that belongs to each time."""
         if self.block_h is None:
             return np.zeros(observation.n_times, dtype=int)
-        hours = observation.hours / self.block_h
-        return np.unique(np.floor(hours), return_inverse=True)[1]
+        return np.unique(np.floor(observation.hours / self.block_h), return_inverse=True)[1]
 
 
 class SourcesSection(Section):

@@ -44,8 +44,7 @@ def close(got: object, expected: object, tol: float = TOL) -> None:
 @eqx.filter_jit
 def _numbers_of_covariance(cov: Covariance, x, xs, factor_of_cov):
     """All numbers that the contract compares, compiled once for every structure."""
-    factor = cov.factor()
-    unit = jnp.eye(cov.size)
+    factor, unit = cov.factor(), jnp.eye(cov.size)
     return {
         "dense": cov.dense(),
         "diagonal": cov.diagonal(),
@@ -91,8 +90,7 @@ def check_covariance(cov: Covariance, dense: np.ndarray, *, slopes: bool = True)
     AssertionError
         If something disagrees.
     """
-    rng = np.random.default_rng(7)
-    n = len(dense)
+    rng, n = np.random.default_rng(7), len(dense)
     x, xs = rng.normal(size=n), rng.normal(size=(n, 3))
     inverse, (sign, log_det) = np.linalg.inv(dense), np.linalg.slogdet(dense)
     assert sign == 1.0

@@ -297,6 +297,8 @@ def with_data(run, name, change):
 CALLS = [
     ("keys", 0, ""),
     ("map no.yaml", 2, "no.yaml"),
+    ("plan fiducial --set frequencies_mhz=[10,20] --vary lmax=3", 2, "a forecast has one freq"),
+    ("validate fiducial --set frequencies_mhz=[10,20]", 2, "a validation has one frequency"),
     ("map fiducial --clock=c.json", 2, "--clock is for session files"),
     ("map --lmax 8", 2, "Unknown option: --lmax. Keys of a scenario are set with --set KEY=VALUE"),
 ]
@@ -337,11 +339,14 @@ def test_evidences_of_other_data_are_not_compared(finished, change, reason):
     assert reason in evidence_caveat([finished, same, other])
     assert "same has" not in evidence_caveat([finished, same, other])
     assert comparison_rows([finished, other])[0]["log_evidence_less_best"] is None
+    added = replace(finished.channel, digests=("earlier", *finished.channel.digests))
+    added = replace(finished, name="sum", channels=(added,))
+    assert "sum was added to other earlier data" in evidence_caveat([finished, added])
     ten = replace(finished, name="ten", channels=(replace(finished.channel, frequency_mhz=10.0),))
     assert "ten is at 10 MHz instead of 25" in evidence_caveat([finished, ten])
 
 
-FEW = [("--simulations=50", "at least 100 simulations"), ("--draws=20", "100 draws of each chain")]
+FEW = [("--simulations=50", "at least 100 simulations"), ("--draws=20", "300 draws of each chain")]
 
 
 @pytest.mark.parametrize(("option", "message"), FEW)

@@ -172,8 +172,7 @@ def test_a_residual_of_large_numbers_is_precise(xp):
 
 def test_few_rows_span_a_matrix():
     """Two kinds of rows, smooth functions of one variable each, that do not help each other."""
-    rng = np.random.default_rng(0)
-    x = np.linspace(0.0, 1.0, 150)
+    rng, x = np.random.default_rng(0), np.linspace(0.0, 1.0, 150)
     kind = rng.integers(0, 2, 150)
     matrix = np.cos(x[:, None] * np.arange(12.0)) * rng.standard_normal(12)
     picked, factors = la.spanning_rows(matrix, kind)

@@ -71,8 +71,7 @@ def test_the_errors_are_what_is_claimed(term):
     total, modes = 0.0, 0
     for seed in (1, 2):
         data, prior, truth = measured(scenario, seed)
-        setup = replace(set_up(scenario, data), prior=prior, family=None)
-        found = settled(setup, Around(data))
+        found = settled(replace(set_up(scenario, data), prior=prior, family=None), Around(data))
         assert not found.unsettled
         same = found.under(found.model.prior).solution
         np.testing.assert_allclose(same.chi2, found.solution.chi2, rtol=1e-8)

@@ -162,15 +162,13 @@ def test_disturbances_are_found_and_little_else(tmp_path):
             comb[:, None] & (np.arange(2048)[within] % 4 == 2)
         )
         flagged = np.rint(reduced.lines[band] * within.sum())
-        rows = ~saturated
-        expected = injected.sum(axis=1)
+        rows, expected = ~saturated, injected.sum(axis=1)
         found = np.minimum(flagged, expected)[rows].sum() / expected[rows].sum()
         others = np.maximum(flagged - expected, 0)[rows].sum() / (~injected[rows]).sum()
         assert found >= 0.95
         assert others <= 1e-3
     # what is left agrees with the sky
-    bins = reduced.bin_of
-    n = reduced.values.shape[2]
+    bins, n = reduced.bin_of, reduced.values.shape[2]
     for band in range(2):
         kept = (reduced.reason[band] == USED).astype(float)
         true = truth["visibility_v2_hz"][band][AUTOS]

@@ -42,8 +42,7 @@ def survey_of(sky, path, unseen=False):
 def mapped(data, *surveys):
     """The inference with these surveys, and its squared distance from the truth per mode."""
     given = f"prior={{model: local_scales, surveys: [{', '.join(surveys)}]}}"
-    scenario = wrong_data.changed(wrong_data.scenario(LMAX, ABOVE), given)
-    experiment = lb.build(scenario, data)
+    experiment = lb.build(wrong_data.changed(wrong_data.scenario(LMAX, ABOVE), given), data)
     found = lb.infer(experiment)
     off = sky_of(2).modes[: n_modes(LMAX)] - found.posterior.mean
     distance = float(off @ np.linalg.solve(found.solution.covariance, off)) / len(off)

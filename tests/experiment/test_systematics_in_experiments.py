@@ -82,14 +82,12 @@ def test_the_sky_above_lmax_is_seen_by_the_instrument_with_its_values(name):
     expected = models.moved(small_experiment(MOVES[name], lmax=7, cycles=0.05).setup, values)
     a, n = np.asarray(expected.coupling.dense()), setup.prior.size
     (term,) = (s for _, s in models.systematics(setup, Around(values=values)) if hasattr(s, "root"))
-    root = setup.above.root[n:]
-    within(term.root, a[:, n:] @ root, 1e-11 * np.abs(term.root).max())
+    within(term.root, a[:, n:] @ setup.above.root[n:], 1e-11 * np.abs(term.root).max())
     assert np.abs(term.root - setup.above.seen[0]).max() > 1e-4 * np.abs(term.root).max()
     sky, ends = setup.sky.modes, setup.scenario.with_section("noise", above_lmax=None)
     flat = replace(setup, scenario=ends, above=None)
     whole, below = (models.true_model(one, values).predict(sky) for one in (setup, flat))
-    added = np.asarray(whole - below)
-    within(added, a[:, n:] @ setup.above.modes, 1e-12 * np.abs(whole).max())
+    within(np.asarray(whole - below), a[:, n:] @ setup.above.modes, 1e-12 * np.abs(whole).max())
 
 
 @pytest.mark.essential

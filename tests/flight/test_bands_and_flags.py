@@ -63,8 +63,7 @@ def test_several_lines_hide_none():
 
 @pytest.mark.parametrize("navgf", [1, 2])
 def test_a_comb_far_below_the_noise_of_a_channel_is_found(navgf):
-    rng = np.random.default_rng(4)
-    averaging = AVERAGING[navgf]
+    rng, averaging = np.random.default_rng(4), AVERAGING[navgf]
     spectra = autos(rng, rows=40, navgf=navgf)
     frames = np.full(40, FRAMES)
     # neighbours predict a channel to fourth order: at 5 MHz, 6e-8 of it
@@ -261,8 +260,7 @@ def test_filter_banks_share_noise_as_noise_through_them_does(taps, taper):
     """White noise through the bank, as a sum over samples: covariances of mean powers."""
     n, frames, sets = 32, 64, 3000
     h = impulse_response(taps, taper)[FRAME // n // 2 :: FRAME // n]
-    rng = np.random.default_rng(8)
-    power = np.zeros((sets, n // 2))
+    rng, power = np.random.default_rng(8), np.zeros((sets, n // 2))
     for start in range(0, sets, 500):
         x = rng.standard_normal((500, (frames + taps - 1) * n))
         for t in range(frames):

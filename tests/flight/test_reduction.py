@@ -246,12 +246,10 @@ def test_the_turntable_turns_when_the_scenario_says(flight, table, reduced):
     """Between spectra 29 and 30, in the middle of a bin."""
     times = reduced.observation.times
     turned = times[29] + 0.5 * (times[30] - times[29])
-    when = turned.isot
-    turns = {"2049-01-01": 90.0, when: 30.0}
+    turns = {"2049-01-01": 90.0, turned.isot: 30.0}
     given = {"timestamp": "middle", "average_s": 4 * 3600.0, "turntable_deg": -5.0}
     given = recipe(table, **given, turns=turns)
-    data = reduce_sessions(sessions(flight), given).at(25.0, np.ones(4))
-    seen = data.observation
+    seen = reduce_sessions(sessions(flight), given).at(25.0, np.ones(4)).observation
     assert seen.turntable_deg == (-5.0, 30.0)
     start, end = seconds_from(turned, seen.times) + seen.windows.bounds_s.T
     assert (end[seen.run == 0] < 0.0).all() and (start[seen.run == 1] > 0.0).all()

@@ -83,8 +83,7 @@ def _changed(array: np.ndarray, change: tuple[Any, ...]) -> np.ndarray:
             return np.asarray([value])
         if kind == "dtype" and array.dtype.kind in "fiuc":
             types = ["S4", "f4", "i4", "i1", "c16", "?"]
-            real = array.real if array.dtype.kind == "c" else array
-            return real.astype(types[number])
+            return (array.real if array.dtype.kind == "c" else array).astype(types[number])
     return np.asarray(value)
 
 

@@ -50,8 +50,7 @@ def test_only_the_sky_above_the_horizon_answers():
 
 
 def test_a_fully_polarised_wave_gives_the_product_of_the_voltages():
-    fields = random_fields(2, 3, GRID)
-    rng = np.random.default_rng(3)
+    fields, rng = random_fields(2, 3, GRID), np.random.default_rng(3)
     for _ in range(5):
         e = rng.standard_normal(2) + 1j * rng.standard_normal(2)
         coherency = np.outer(e, e.conj())  # [[I + Q, U - i V], [U + i V, I - Q]] / 2

@@ -215,8 +215,7 @@ def test_sites_of_the_antennas_parameters(instrument, base):
 
 
 def test_the_amplitude_of_a_beam_error(instrument, base, pointing, layout):
-    other = lb.monopole_beams(29.0, LOW)
-    own = instrument.beams()
+    other, own = lb.monopole_beams(29.0, LOW), instrument.beams()
     error = BeamError(CouplingMatrix.of_modes(other.modes - own.modes, pointing, layout))
     sky = base.prior.sample(jax.random.key(3))
     for amplitude in (0.0, 0.7, 1.0):

@@ -136,8 +136,7 @@ def modes_of(given, **more):
 def test_the_scale_is_the_autos_or_the_files():
     given = dict(embedded("grid"))
     bright = given | {"e_theta": 3.0 * given["e_theta"], "e_phi": 3.0 * given["e_phi"]}
-    scaled = modes_of(bright)
-    autos = scaled[[0, 7, 12, 15], 0] * np.sqrt(4 * np.pi)
+    autos = modes_of(bright)[[0, 7, 12, 15], 0] * np.sqrt(4 * np.pi)
     np.testing.assert_allclose(autos.mean(), 1.0, rtol=1e-12)
     one, nine = (modes_of(g, absolute=True) for g in (given, bright))
     np.testing.assert_allclose(nine, 9.0 * one, rtol=1e-12, atol=1e-12 * np.abs(nine).max())

@@ -37,8 +37,7 @@ def windows_of(pieces):
 def observed(keep=None, windows="odd", runs=RUNS):
     """15 and 11 samples; every third is made of two pieces."""
     observation = lb.Observation.from_runs(runs, step_s=STEP, window="mean")
-    rng = np.random.default_rng(7)
-    n = observation.n_times
+    rng, n = np.random.default_rng(7), observation.n_times
     if windows == "odd":
         found = []
         for k in range(n):
@@ -222,8 +221,7 @@ def test_what_cannot_be_averaged(windows, to_s, words):
 
 def partly_filled(n, step_s, seed=1):
     """Whole windows, windows that end early, and windows with one or two gaps."""
-    rng = np.random.default_rng(seed)
-    found = []
+    rng, found = np.random.default_rng(seed), []
     for k in range(n):
         edges = np.sort(rng.uniform(-0.5, 0.5, 2 * (k % 4))) * step_s
         edges = np.concatenate([[-step_s / 2], edges, [step_s / 2]])

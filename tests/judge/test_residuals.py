@@ -39,8 +39,7 @@ def simulated(*overrides, flags=None):
     e = lb.build(scenario)
     if flags is not None:
         e = lb.build(scenario, flagged(e.data, flags))
-    model = full_model(e.setup)
-    rng = np.random.default_rng(8)
+    model, rng = full_model(e.setup), np.random.default_rng(8)
     sky = np.sqrt(np.asarray(model.prior.variance())) * rng.standard_normal(model.prior.size)
     noise = np.linalg.cholesky(np.asarray(model.noise.dense())) @ rng.standard_normal(model.n_data)
     seen = np.asarray(model.coupling @ jnp.asarray(sky)) + noise

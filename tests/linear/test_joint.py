@@ -48,8 +48,7 @@ def covariance_of(prior):
 
 def models(prior, seed=4):
     """Channels with different numbers of data; noise ten times below the sky."""
-    rng = np.random.default_rng(seed)
-    made = []
+    rng, made = np.random.default_rng(seed), []
     for k in range(len(FREQUENCIES)):
         n = 12 + 3 * k
         a = jnp.asarray(rng.standard_normal((n, N_MODES)))
@@ -76,8 +75,7 @@ def information_from(made, data):
 
 
 def drawn(prior, made, seed=2):
-    rng = np.random.default_rng(seed)
-    s = covariance_of(prior)
+    rng, s = np.random.default_rng(seed), covariance_of(prior)
     sky = np.linalg.cholesky(s + 1e-12 * np.diag(np.diag(s))) @ rng.standard_normal(len(s))
     sky = sky.reshape(len(made), N_MODES)
     data = []
@@ -130,14 +128,18 @@ def test_the_direct_solution_is_the_textbooks(case, place):
         lower = np.linalg.cholesky(np.asarray(sky.covariance))
         z = np.linalg.solve(lower, (np.asarray(sky.draws) - np.asarray(sky.mean)).T)
         assert np.abs(z @ z.T / 4000 - np.eye(N_MODES)).max() < z_of(81) * np.sqrt(2 / 4000)
+    # of two channels: what they have of the component maps
+    given = [(prior, k, on_host(one), np.eye(N_MODES)) for k, one in enumerate(channels)]
+    seen = np.concatenate([joint.slopes(*one) for one in given]) @ np.asarray(found.root())
+    others = np.kron(1.0 - np.eye(len(channels)), np.ones((N_MODES, N_MODES)))
+    within(others * (seen @ seen.T), others * covariance, 1e-7 * std.max() ** 2)
 
 
 def test_skies_that_do_not_obey_the_prior_are_told():
     """Skies with a rest of their own, under a prior that has none: evidence and residuals fall."""
     true = components(FREQUENCIES, skies(), ("power_law",), residual=0.2)
     wrong = components(FREQUENCIES, skies(), ("power_law",), residual=1e-4)
-    made = models(true)
-    found = {}
+    made, found = models(true), {}
     for name, obeys in (("obeyed", wrong), ("not obeyed", true)):
         data = drawn(obeys, made)
         channels, reference = information_from(made, data)

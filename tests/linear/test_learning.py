@@ -40,8 +40,7 @@ class Case:
 @pytest.fixture(scope="module")
 def case() -> Case:
     family = IsotropicFamily.around(2e4, LMAX)
-    rng = np.random.default_rng(1)
-    truth = family.hyperprior.start()
+    rng, truth = np.random.default_rng(1), family.hyperprior.start()
     truth[:2] += [0.7, -0.3]
     sky = np.asarray(family.prior(family.at(truth).covariance).sample(jax.random.key(4)))
     return Case(family, information_of(np.array(sky), seed=int(rng.integers(100))), truth)
@@ -131,8 +130,7 @@ def test_others_integrated_out(case):
     spectrum = np.geomspace(1e8, 1e5, LMAX + 1)
     mean = np.asarray(lb.HarmonicPrior(spectrum).sample(jax.random.key(1)))
     prior = lb.HarmonicPrior(spectrum, mean=mean)
-    everything = case.information.posterior(prior)
-    n = 16
+    everything, n = case.information.posterior(prior), 16
     few = integrated_out(case.information, n, np.asarray(prior.variance())[n:], mean[n:])
     found = few.posterior(lb.HarmonicPrior(spectrum[:4], mean=mean[:n]))
     assert float(found.log_evidence) == pytest.approx(float(everything.log_evidence), abs=1e-6)
@@ -221,8 +219,7 @@ def test_an_unseen_cell_has_the_factor_that_is_expected_of_it():
 
 def test_raised_information_is_that_of_raised_noise():
     """Of the same data under N times a factor."""
-    rng = np.random.default_rng(3)
-    n = (LMAX + 1) ** 2
+    rng, n = np.random.default_rng(3), (LMAX + 1) ** 2
     coupling, data = rng.standard_normal((N_DATA, n)), 100.0 * rng.standard_normal(N_DATA)
     prior = lb.HarmonicPrior(np.full(LMAX + 1, 1e4))
     noise = (lb.DiagonalCovariance(np.full(N_DATA, variance)) for variance in (9.0, 63.0))

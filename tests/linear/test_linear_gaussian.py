@@ -38,8 +38,7 @@ def per_mode(spectrum) -> np.ndarray:
 
 def noise_terms(n_data: int):
     """Every structure of N over 3 products x n_data / 3 times."""
-    rng = np.random.default_rng(11)
-    layout = DataLayout(3, n_data // 3)
+    rng, layout = np.random.default_rng(11), DataLayout(3, n_data // 3)
     diagonal = lb.DiagonalCovariance(jnp.asarray(rng.uniform(0.5, 2.0, n_data)))
     blocks = np.stack([oracle.random_covariance(rng, 3) for _ in range(layout.n_times)])
     time_blocks = TimeBlockCovariance(jnp.asarray(blocks), layout)

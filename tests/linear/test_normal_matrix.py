@@ -88,8 +88,7 @@ def test_equals_the_product_of_matrices(place, kind, order, missing):
 
 
 def test_more_times_than_a_chunk():
-    rng = np.random.default_rng(0)
-    n = CHUNK + 37
+    rng, n = np.random.default_rng(0), CHUNK + 37
     weights, phi = rng.standard_normal((2, n)), rng.uniform(0, 9, n)
     factors = rng.standard_normal((3, n))
     got = time_sums(weights, phi, factors.T, 2)
@@ -138,8 +137,7 @@ NOISES = ["diagonal", *(pytest.param(k, marks=pytest.mark.long) for k in ("offse
 
 @pytest.mark.parametrize("kind", NOISES)
 def test_information_gives_the_posterior_of_the_dense_form(kind):
-    gaussian = model(kind)
-    rng = np.random.default_rng(11)
+    gaussian, rng = model(kind), np.random.default_rng(11)
     data = jnp.asarray(rng.standard_normal(gaussian.n_data))
     expected = gaussian.condition(data, form=InMap).posterior
     solution = gaussian.condition(data, FromInformation)

@@ -67,8 +67,7 @@ def _directions(n, rank=2, seed=11):
 
 def _terms(flags):
     """kind: (covariance, the same matrix by hand) of every kind, for one layout."""
-    rng = np.random.default_rng(3)
-    layout = DataLayout.from_flags(flags)
+    rng, layout = np.random.default_rng(3), DataLayout.from_flags(flags)
     entries = _entries(flags)
     n = len(entries)
     variance = rng.uniform(0.5, 2.0, n)

@@ -95,8 +95,7 @@ def test_mean_and_covariance_of_simulated_histories():
     Gaussian e would not do.
     """
     n_antennas, sigma, n, chunk = 3, 0.3, 100_000, 20_000
-    rng = np.random.default_rng(20270115)
-    d = visibilities(n_antennas)
+    rng, d = np.random.default_rng(20270115), visibilities(n_antennas)
     flags = gappy(n_antennas)
     drift = GainDrift(sigma, 10.0)
     response = np.array([1.0 + sigma**2 * (i == j) for i, j in pairs(n_antennas)])

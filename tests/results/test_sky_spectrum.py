@@ -1,5 +1,7 @@
 """The spectrum of the sky: temperatures of regions, and what the errors of channels share."""
 
+from dataclasses import replace
+
 import healpy
 import numpy as np
 import pytest
@@ -12,15 +14,9 @@ from commands import run
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import averaging_rows, modes_to_map, per_mode, taper
 from lusee_bayes.report.figures.maps import spectrum_figure
+from lusee_bayes.results import sky_spectrum as sp
 from lusee_bayes.results.signal_limit import named_template, signal_limit
-from lusee_bayes.results.sky_spectrum import (
-    Departure,
-    IndexMaps,
-    RegionTemperatures,
-    SkySpectrum,
-    cane_1979,
-    novaco_brown_1978,
-)
+from lusee_bayes.sky.prior import IndependentPrior
 
 SMALL = ["lmax=4", "observation.runs.0.cycles=0.1", "prior={model: isotropic, spectrum: sky}"]
 
@@ -30,7 +26,7 @@ def test_published_spectra_are_brightness_temperatures():
     for f, tau in ((5.0, 5.0 * 5.0**-2.1), (20.0, 5.0 * 20.0**-2.1)):
         poles = 2.48e-20 * f**-0.52 * (1 - np.exp(-tau)) / tau + 1.06e-20 * f**-0.8 * np.exp(-tau)
         whole = 1.38e-19 * f**-0.76 * np.exp(-3.28 * f**-0.64)
-        for law, intensity in ((cane_1979, poles), (novaco_brown_1978, whole)):
+        for law, intensity in ((sp.cane_1979, poles), (sp.novaco_brown_1978, whole)):
             of = intensity * u.W / u.m**2 / u.Hz / u.sr
             expected = of.to(u.Jy / u.sr).to_value(u.K, u.brightness_temperature(f * u.MHz))
             assert law(np.array([f]))[0] == pytest.approx(expected, rel=1e-9)
@@ -45,13 +41,12 @@ def test_index_and_turnover_are_those_of_a_parabola():
     relative = np.linspace(0.01, 0.03, 7)[:, None, None]
     skies = np.exp(design @ cells)[:, None] * np.exp(relative * rng.normal(size=(7, 4000, 3)))
     skies[3, :400, 2] = -1.0  # a tenth of the draws has no logarithm
-    found = IndexMaps.of(f, skies)
+    found = sp.IndexMaps.of(f, skies)
     assert found.reference_mhz == pytest.approx(10.0)
     weighted = design / relative[:, 0]
     std = np.sqrt(np.diag(np.linalg.inv(weighted.T @ weighted)))
     for k, name in enumerate(("index", "curvature"), 1):
-        error = found.maps[f"{name}_std"]
-        within(error[:2] / std[k], 1.0, 5.0 / np.sqrt(8000.0))
+        within(found.maps[f"{name}_std"][:2] / std[k], 1.0, 5.0 / np.sqrt(8000.0))
         within(found.maps[name][:2], cells[k, :2], 5.0 * std[k] / np.sqrt(4000.0))
     # the first has none in the band; d ln T / dx = 0 at x = -b / 2 c
     turnover = 10.0 * np.exp(-1.0 / 3.0)
@@ -119,14 +114,14 @@ def test_files_have_the_spectrum_with_its_covariance(joint, tmp_path, capsys):
 def spectrum_of(f, temperature, covariance):
     shares = np.stack([np.full((1, len(f)), 0.9), np.full((1, len(f)), 0.1)])
     given = ("observed sky",), ("gains", "ground"), f, temperature[None], covariance[None]
-    return SkySpectrum(*given, None, shares)
+    return sp.SkySpectrum(*given, None, shares)
 
 
 @pytest.mark.parametrize(("injected", "found"), [(-0.025, False), (800.0, True)])
 def test_limits_on_a_signal_cover_it(injected, found):
     """100 data sets of a sky that turns over, of another family than the polynomial."""
     f = np.arange(5.0, 51.0)
-    sky = cane_1979(f) * np.exp(-((4.0 / f) ** 2.1))
+    sky = sp.cane_1979(f) * np.exp(-((4.0 / f) ** 2.1))
     trough = -np.exp(-0.5 * ((f - 17.5) / 3.0) ** 2)
     alike = np.exp(-0.5 * (np.log2(f[:, None] / f) / 0.3) ** 2)
     covariance = np.outer(sky, sky) * (0.7 * alike + 0.3 * np.eye(len(f))) * 1e-6
@@ -173,7 +168,7 @@ def test_skies_that_are_alike_have_errors_that_are_alike():
 
     A measured mean is (1 - c) u + noise of variance c (1 - c), with the posterior variance c.
     """
-    rng, rho, c = np.random.default_rng(3), 0.9, np.repeat([1e-4, 0.95], [150, 50])
+    rng, rho, c = np.random.default_rng(3), 0.9, np.repeat([1e-4, 0.5, 0.95], [100, 50, 50])
     row = rng.normal(size=200)
     u = rng.normal(size=(4000, 2, 200))
     u[:, 1] = rho * u[:, 0] + np.sqrt(1.0 - rho**2) * u[:, 1]
@@ -181,11 +176,22 @@ def test_skies_that_are_alike_have_errors_that_are_alike():
     errors = np.cov(((means - u) @ row).T)
     given, none = (("sky",), ()), np.zeros((1, 0))
     std, zero = np.sqrt([row**2 @ c]), np.zeros(1)
-    channel = RegionTemperatures(*given, zero, std, None, none, none.T, none.T, None)
-    departures = [Departure(mean, (row * c)[None]) for mean in means[0]]
+    channel = sp.RegionTemperatures(*given, zero, std, None, none, none.T, none.T, None)
+    measured = [mean / np.sqrt(mean**2 @ (1.0 - c)) for mean in means[0]]
+    departures = [sp.Departure(mean, (row * c)[None]) for mean in measured]
     each = [(mhz, channel, one) for mhz, one in zip([10.0, 11.0], departures, strict=True)]
-    covariance = SkySpectrum.of(each).covariance[0]
+    covariance = sp.SkySpectrum.of(each).covariance[0]
     # 1 / sqrt(4000) of the draws, 1 / sqrt(150) of the measured correlation; three of each
     np.testing.assert_allclose(np.diag(covariance), np.diag(errors), rtol=0.07)
     assert covariance[0, 1] == pytest.approx(errors[0, 1], rel=0.15)
     assert errors[0, 1] > 0.5 * errors[0, 0]
+    noise = lb.DiagonalCovariance(np.ones(9))
+    # unknown maps of a joint posterior: its covariance between channels, not that of its draws
+    posterior = lb.LinearGaussian(rng.normal(size=(9, 4)), IndependentPrior(np.ones(4)), noise)
+    posterior = posterior.condition(np.ones(9)).posterior
+    slopes = rng.normal(size=(3, 1, 4))
+    each = [replace(channel, common=one, draws=np.zeros((5, 1))) for one in slopes]
+    each = sp.combined(each, posterior)
+    covariance = sp.SkySpectrum.of([(0.0, one, None) for one in each]).covariance[0]
+    exact = slopes[:, 0] @ posterior.covariance() @ slopes[:, 0].T
+    np.testing.assert_allclose(covariance[np.tril_indices(3, -1)], exact[np.tril_indices(3, -1)])

@@ -147,8 +147,7 @@ def state_of(folder: Path, command: Command, earlier: Path | None) -> str:
     with locked(folder):
         pass
     assert not list(folder.glob(f"{SCRATCH}*")) and not (folder / ".committed").exists()
-    before = content(earlier) if earlier else {}
-    found = content(folder)
+    before, found = content(earlier) if earlier else {}, content(folder)
     if found.get(MANIFEST) is not None and numbers(folder).keys() == numbers(command.folder).keys():
         written = {n for n in found if not n.startswith(f"{command.unfinished}/")}
         if {n: found[n] for n in written} != before:

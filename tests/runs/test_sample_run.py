@@ -296,17 +296,36 @@ def test_sampling_json_tells_of_the_very_run(runs, tree):
     assert {"lusee_bayes", "jax", "numpyro", "arviz-stats"} <= set(figures["versions"])
 
 
-@pytest.mark.parametrize("program", ["sky_marginal", "prior_amplitude"])
+# data tell nothing of its two sites
+PLATED = """
+import numpyro, lusee_bayes as lb
+def model(coupling, offset, prior, noise, data=None):
+    with numpyro.plate("two", 2):
+        numpyro.sample("x", numpyro.distributions.Normal())
+    gaussian = lb.LinearGaussian(coupling, prior, noise, offset)
+    numpyro.sample("data", lb.Marginal(gaussian), obs=data)
+    return gaussian
+"""
+
+
+@pytest.mark.parametrize("program", ["sky_marginal", "prior_amplitude", "plated"])
 def test_programs_without_the_sky_get_their_maps_too(program, tmp_path):
-    out = tmp_path / "out"
-    arguments = ["--model", program, "--draws", "150", "--warmup", "100", "--chains", "2"]
+    out, own = tmp_path / "out", tmp_path / "plated.py"
+    own.write_text(PLATED)
+    given = own if program == "plated" else program
+    arguments = ["--model", given, "--draws", "150", "--warmup", "100", "--chains", "2"]
     assert run("sample", *SMALL, *arguments, "-q", "-o", out) == 0
     tree = read_datatree(out / "samples.nc")
     assert set(tree.children) == GROUPS
     others = set(tree["posterior"].data_vars) - {"sky"}
     expected = {"sky_marginal": {"noise_level"}, "prior_amplitude": {"amplitude", "tilt"}}
+    expected["plated"] = {"x"}
     assert others == expected[program]
-    assert expected[program] <= set(pd.read_csv(out / "summary.csv", index_col="quantity").index)
+    table = pd.read_csv(out / "summary.csv", index_col="quantity")
+    if program == "plated":
+        np.testing.assert_allclose(table.loc[["x[0]", "x[1]"], "sd"], 1.0, atol=0.3)
+    else:
+        assert expected[program] <= set(table.index)
     skies = tree["posterior"]["sky"].values.reshape(-1, N_MODES)
     mean = healpy.read_map(out / "map.fits", dtype=np.float64)
     np.testing.assert_allclose(mean, modes_to_map(skies.mean(0), NSIDE), rtol=1e-9)

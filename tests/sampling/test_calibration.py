@@ -109,8 +109,7 @@ def test_the_threshold_is_shared_by_all_quantities():
     assert eight.threshold == pytest.approx(validation.FALSE_ALARM / 8)
     p, moved = 1.0, 0
     while p > validation.FALSE_ALARM:
-        where = 5 + 5 * (moved % 19) + 100 * (moved // 19)
-        uneven[where] = 0
+        uneven[(5 + 5 * (moved % 19) + 100 * (moved // 19))] = 0
         moved += 1
         p = ranks_of(uneven).p_values()[0]
     assert validation.FALSE_ALARM / 8 < p < validation.FALSE_ALARM

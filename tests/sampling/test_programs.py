@@ -158,8 +158,7 @@ def test_arguments_are_what_the_signature_names(write, gaussian):
 
 
 def test_which_programs_have_integrated_the_sky_out(write, gaussian):
-    data = np.asarray(gaussian.sample(jax.random.key(0))[1])
-    found = {}
+    data, found = np.asarray(gaussian.sample(jax.random.key(0))[1]), {}
     for name in ("sky", "sky_marginal", "prior_amplitude"):
         program = lb.load_program(name)
         found[name] = programs.is_collapsed(program, program.arguments(gaussian), data)

@@ -22,7 +22,7 @@ from small_models import random_gaussian
 import lusee_bayes as lb
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
 from lusee_bayes.noise.covariance import DenseCovariance
-from lusee_bayes.sampling.hmc import whitened
+from lusee_bayes.sampling.hmc import Whitening, whitened
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sky.prior import DensePrior
@@ -149,6 +149,19 @@ def test_z_is_standard_normal_where_the_coordinates_are_the_posteriors(gaussian,
         assert got == pytest.approx(expected, rel=1e-11)
 
 
+def test_a_site_in_a_plate_keeps_its_density():
+    def plated(data=None):
+        with numpyro.plate("bands", 3):
+            numpyro.sample("sky", dist.LogNormal(0.0, 1.0))
+
+    def plain(data=None):
+        numpyro.sample("sky", dist.LogNormal(0.0, 1.0).expand([3]).to_event(1))
+
+    whitening = Whitening(jnp.zeros(3), jnp.eye(3), jnp.zeros(()), (("sky", (3,)),))
+    at = {"sky_white": np.array([0.3, -2.0, 1.0])}
+    assert joint(whitened(plated, whitening), {}, at) == joint(whitened(plain, whitening), {}, at)
+
+
 @pytest.mark.parametrize("how", ["obs", "condition"])
 def test_an_observed_sky_is_not_whitened(case, z, how):
     arguments, whitening = case
@@ -164,8 +177,7 @@ def test_an_observed_sky_is_not_whitened(case, z, how):
 def test_predictions_from_draws_of_z(gaussian, case):
     """Data seen again have mean A E[m | d] and covariance A C A^T + N."""
     arguments, whitening = case
-    posterior = gaussian.condition(arguments["data"]).posterior
-    n = 4000
+    posterior, n = gaussian.condition(arguments["data"]).posterior, 4000
     z = jax.random.normal(jax.random.key(3), (n, 9), dtype=jnp.float64)
     free = {**arguments, "data": None}
     with numpyro_promotion():

@@ -109,7 +109,7 @@ def test_scores_of_means_and_variances_are_standard_normal(turns):
     posterior = wrong_posterior(mean, np.diag(scale**2))
     means, variances = [], []
     for seed in range(30):
-        white, energy = chains(seed, turns, 250)
+        white, energy = chains(seed, turns, 300)
         found = judge(mean + white * scale, energy, posterior)
         means.append(found.mean_z)
         variances.append(validation._chi2_z(found.variance_ratio, 2 / found.variance_error**2))
@@ -236,7 +236,7 @@ def test_badly_explored_energies_fail(truth):
 
 NOT_COMPARED = [
     (lambda x: x[..., :-1], r"has shape \(4, 500, 15\), expected .* 16\)"),
-    (lambda x: x[:, :99], "needs 100 draws of each chain, got 99"),
+    (lambda x: x[:, :299], "needs 300 draws of each chain, got 299"),
     (lambda x: np.where(np.arange(MODES) == 3, np.nan, x), "NaN or infinity"),
     (lambda x: np.where(np.arange(MODES) == 3, np.inf, x), "NaN or infinity"),
 ]
@@ -247,8 +247,8 @@ def test_draws_that_cannot_be_compared_are_refused(truth, broken, message):
     draws, energy = truth.draws(9)
     draws = broken(draws)
     refuse(message, judge, draws, energy[:, : draws.shape[1]], truth.posterior)
-    # a hundred are enough to be judged
-    assert judge(*truth.draws(9, draws=100), truth.posterior).eigenvalues.shape == (MODES,)
+    # three hundred are enough to be judged
+    assert judge(*truth.draws(9, draws=300), truth.posterior).eigenvalues.shape == (MODES,)
 
 
 # --- thresholds -------------------------------------------------------------------------------

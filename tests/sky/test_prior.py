@@ -109,8 +109,7 @@ def test_pixels_of_an_isotropic_sky_are_those_of_the_addition_theorem(harmonic):
 
 
 def test_a_prior_can_be_built_inside_jit_from_known_numbers():
-    spectrum = jnp.asarray(SPECTRUM)
-    got = jax.jit(lambda u: lb.HarmonicPrior(spectrum).colour(u))(jnp.ones(16))
+    got = jax.jit(lambda u: lb.HarmonicPrior(jnp.asarray(SPECTRUM)).colour(u))(jnp.ones(16))
     np.testing.assert_allclose(got, np.sqrt(PER_MODE))
 
 
@@ -236,8 +235,7 @@ def test_windows_share_every_ell(lmax):
 
 def test_the_diagonal_on_a_grid():
     """y^T C y of dense harmonics, and the adjoint of multiplication by a field."""
-    rng = np.random.default_rng(5)
-    grid = SphereGrid.of(4, 7)
+    rng, grid = np.random.default_rng(5), SphereGrid.of(4, 7)
     half = rng.standard_normal((25, 25))
     matrix, field = half @ half.T, rng.standard_normal(grid.shape)
     harmonics = synthesis_matrix(*grid.directions(), 4)

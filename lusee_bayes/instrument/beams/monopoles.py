@@ -252,8 +252,7 @@ class Monopoles(BeamSource, eqx.Module):
         to_direct = (along * cos - up * sin).astype(direct.dtype)
         to_bounced = (along * cos + up * sin).astype(direct.dtype)
         e_theta = to_direct * direct - p * to_bounced * bounced
-        e_phi = across.astype(direct.dtype) * (direct + s * bounced)
-        return e_theta, e_phi
+        return e_theta, across.astype(direct.dtype) * (direct + s * bounced)
 
     def _current_integral(self, k: Scalar, projection: Array) -> Fields:
         """int_0^L sin k(L - s) exp(i k s projection) ds.

@@ -119,8 +119,7 @@ def plot_map(sky: MapResult | Posterior | Modes, nside: int = 64) -> Figure:
     """
     if isinstance(sky, MapResult):
         return channel_map(sky.channel)
-    mean = np.asarray(sky.mean if isinstance(sky, Posterior) else sky)
-    pixels = drawing.shown(mean, nside)
+    pixels = drawing.shown(np.asarray(sky.mean if isinstance(sky, Posterior) else sky), nside)
     panels = {"sky": (pixels, drawing.temperatures(pixels))}
     if isinstance(sky, Posterior):
         std = pixel_std(np.asarray(sky.covariance()), nside)
