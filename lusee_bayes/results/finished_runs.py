@@ -310,6 +310,8 @@ def read_channels(path: str | Path) -> tuple[ChannelResult, ...]:
     what = "diagnostics of lusee-bayes map"
     with opened_tree(path, formats.DIAGNOSTICS, what, "lusee-bayes map writes one") as tree:
         named = sorted(tree.children.items(), key=lambda one: float(one[0]))
+        if not named:
+            raise InputError(f"{path} has no channels; map again")
         return tuple(from_tree(ChannelResult, one, f"{path}: {f} MHz") for f, one in named)
 
 
