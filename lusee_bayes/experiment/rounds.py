@@ -47,7 +47,7 @@ TEMPERED, MAX_TEMPERED_ROUNDS = 10.0, 20
 WIDE = 1e2, 1e1
 # if, even then, chi^2 is too large by FAR_OFF of its standard deviations, up to OTHER_WAYS other
 # starting points are tried
-FAR_OFF, OTHER_WAYS = 10.0, 6
+FAR_OFF, OTHER_WAYS = 10.0, 10
 # each other way starts from the likeliest of CANDIDATES instruments; a round has stalled if more
 # than this fraction of the excess chi^2 remains after it
 CANDIDATES, STALLED = 8, 0.5
@@ -208,7 +208,7 @@ def settled(
     expansion point is 10 per datum, and solve for the sky of each instrument (variable projection:
     the first order in values then has no product with a change of the sky). With many data, this is
     first done with a regular subset of the times. Values move only part of the way if the step is
-    long or oscillates. If no sky fits at the end, under any prior, the rounds restart up to six
+    long or oscillates. If no sky fits at the end, under any prior, the rounds restart up to ten
     times (of the subset only: if some data do not fit, neither do all): about half of the values,
     or all, are drawn again from their prior, and the likeliest of eight such instruments is the
     start. The result with the largest ln p counts.
