@@ -510,8 +510,7 @@ def write_four_port(
     largest = np.abs(eigenvalues).max(-1)
     ratio = np.divide(eigenvalues[..., 0], largest, out=np.zeros_like(largest), where=largest > 0)
     # visibilities are real products of a Hermitian matrix
-    none = np.zeros_like(ratio)
-    names = receiver.luseepy_parameters
+    none, names = np.zeros_like(ratio), receiver.luseepy_parameters
     parameters = json.dumps({k: getattr(receiver, n) for k, n in names.items()}, sort_keys=True)
     images: list[tuple[str, Any, str]] = [
         ("data", data, UNIT),

@@ -304,7 +304,7 @@ def common_covariance(prior: SpectralPrior, channel: int, covariances: Blocks) -
     return whole
 
 
-def slopes(
+def sky_slopes(
     prior: SpectralPrior, channel: int, information: Information, rows: Float[Array, "rows modes"]
 ) -> Float[np.ndarray, "rows unknowns"]:
     """Derivatives of linear functions of a channel's sky by all unknowns.

@@ -64,8 +64,7 @@ def gaussian_of_sites(
         The sampled sites; for a single channel, names without the channel.
     """
     mhz = np.array([frequencies_mhz[channel] for channel in amplitudes])
-    sizes = [u.size or 1 for u in unknowns]
-    untied = np.eye(len(mhz))
+    sizes, untied = [u.size or 1 for u in unknowns], np.eye(len(mhz))
     tying = [kernel(mhz, octaves[u.name]) if u.name in octaves else untied for u in unknowns]
     mean = np.stack([one.mean for one in amplitudes.values()])
     covariance = np.stack([one.covariance for one in amplitudes.values()])

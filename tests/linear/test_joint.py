@@ -130,7 +130,7 @@ def test_the_direct_solution_is_the_textbooks(case, place):
         assert np.abs(z @ z.T / 4000 - np.eye(N_MODES)).max() < z_of(81) * np.sqrt(2 / 4000)
     # of two channels: what they have of the component maps
     given = [(prior, k, on_host(one), np.eye(N_MODES)) for k, one in enumerate(channels)]
-    seen = np.concatenate([joint.slopes(*one) for one in given]) @ np.asarray(found.root())
+    seen = np.concatenate([joint.sky_slopes(*one) for one in given]) @ np.asarray(found.root())
     others = np.kron(1.0 - np.eye(len(channels)), np.ones((N_MODES, N_MODES)))
     within(others * (seen @ seen.T), others * covariance, 1e-7 * std.max() ** 2)
 

@@ -38,7 +38,8 @@ for module, name in ((map_run, "MAP"), (sample_run, "SAMPLE"), (paper_run, "PAPE
 tiny, *arguments = sys.argv[1:]
 cases.CASES = {name: ("fiducial", [*tiny.split(), f"noise.radiometer.factor={factor}"])
                for name, factor in (("fiducial", 1), ("noise_x10", 10), ("noise_x100", 100))}
-paper_run.claim_table = lambda cases: [dict.fromkeys("section paper obtained agrees reason".split(), "")]
+claim = dict.fromkeys(("section", "paper", "obtained", "agrees", "reason"), "yes")
+paper_run.claim_table = lambda cases: [claim]
 print("started", flush=True)
 sys.exit(main(arguments))
 """
