@@ -16,9 +16,9 @@ u' K u', with the fraction K = 1 - G^-1 C G^-T that the data measure. Both terms
 whole variance, so the matrix is positive definite.
 
 In a joint posterior the prior correlates the skies. L m_f is linear in the component maps and the
-shared unknowns x, with the slope W_f (:func:`.joint.sky_slopes`), and the rest is independent of other
-channels: the covariance is W_f Cov(x) W_g^T. That of positive skies is estimated from draws, times
-the factor that makes the mean of its inverse right (Hartlap et al. 2007, A&A 464, 399).
+shared unknowns x, with the slope W_f (:func:`.joint.sky_slopes`), and the rest is independent of
+other channels: the covariance is W_f Cov(x) W_g^T. That of positive skies is estimated from draws,
+times the factor that makes the mean of its inverse right (Hartlap et al. 2007, A&A 464, 399).
 Parameters of a learned prior have their most probable values.
 """
 
