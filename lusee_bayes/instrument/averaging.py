@@ -119,8 +119,7 @@ def windowed(
     delta = delta - mean[sample]
     largest = float(np.abs(delta).max())
     n_moments = terms_of_exponential(lmax * largest, ROUNDING)
-    scaled = delta / (largest or 1.0)
-    powers = tilt_powers(order)
+    scaled, powers = delta / (largest or 1.0), tilt_powers(order)
     ex, ey = -tilt[:, 0], -tilt[:, 1]
     # the transpose of the exponential has the opposite sign
     e = np.stack([ex**a * ey**b / factorial(a + b) for a, b in powers], axis=1)

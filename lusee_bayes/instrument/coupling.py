@@ -565,8 +565,7 @@ def _by_order(body_beams: BodyBeams, lmax: int) -> Float[Array, "runs orders bea
 def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*batch degrees orders"]:
     """c_lm for l = 0..lmax, then c_l,-m, for m = 0..lmax; zero for l < m, and for c_l,-0."""
     ell, m = np.arange(lmax + 1)[:, None], np.arange(lmax + 1)[None]
-    centre = ell**2 + ell
-    xp = namespace(modes)
+    centre, xp = ell**2 + ell, namespace(modes)
     plus = xp.where(ell >= m, modes[..., np.where(ell >= m, centre + m, 0)], 0.0)
     inside = (ell >= m) & (m > 0)
     minus = xp.where(inside, modes[..., np.where(inside, centre - m, 0)], 0.0)

@@ -305,7 +305,11 @@ def common_covariance(prior: SpectralPrior, channel: int, covariances: Blocks) -
 
 
 def sky_slopes(
-    prior: SpectralPrior, channel: int, information: Information, rows: Float[Array, "rows modes"]
+    prior: SpectralPrior,
+    channel: int,
+    information: Information,
+    lower: ModesMatrix | None,
+    rows: Float[Array, "rows modes"],
 ) -> Float[np.ndarray, "rows unknowns"]:
     """Derivatives of linear functions of a channel's sky by all unknowns.
 
@@ -317,13 +321,14 @@ def sky_slopes(
         Number of the channel in the prior.
     information : Information
         Of the channel's data.
+    lower : (modes, modes) array or None
+        :attr:`ChannelSky.lower`.
     rows : (rows, modes) array
         The linear functions.
     """
     n, root = n_modes(prior.lmax), on_host(prior.residual_root(channel))
     seen, shared = rows, np.zeros((len(rows), information.n_modes - n))
     if root is not None:
-        lower = residual_lower(information, root)
         half = linalg.solve_lower(lower, (rows * root).T, transpose=False)
         back = linalg.solve_lower(lower, half, transpose=True).T
         seen, shared = back / root, -(root * back) @ information.matrix[:n, n:]
@@ -341,11 +346,14 @@ class ChannelSky(eqx.Module):
         In K^2; None if the covariance of the component maps was not given.
     draws : (n, modes + shared) array
         In K.
+    lower : (modes, modes) array or None
+        :func:`residual_lower`; None if there is no residual.
     """
 
     mean: Float[Array, " whole"]
     covariance: Float[Array, "whole whole"] | None
     draws: Whole
+    lower: ModesMatrix | None = None
 
 
 def channel_sky(
@@ -391,7 +399,7 @@ def channel_sky(
     require_shape("the mean of all unknowns", mean, (prior.n_components * n + shared,))
     z = jax.random.normal(jax.random.fold_in(key, channel), (len(draws), n), dtype=jnp.float64)
     prior, mean, covariances, draws, z = on_host((prior, mean, covariances, draws, z))
-    residual_root = prior.residual_root(channel)
+    residual_root, lower = prior.residual_root(channel), None
     # for the mean and every draw
     whole = common_of(prior, channel, np.concatenate([mean[None], draws]))
     covariance = None if covariances is None else common_covariance(prior, channel, covariances)
@@ -408,7 +416,7 @@ def channel_sky(
         whole[:, :n] = information.reference[:n] + moved
         if covariance is not None:
             covariance = _with_residual(covariance, information, residual_root, lower)
-    return ChannelSky(whole[0], covariance, whole[1:])
+    return ChannelSky(whole[0], covariance, whole[1:], lower)
 
 
 def _with_residual(

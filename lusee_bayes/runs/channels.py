@@ -182,7 +182,7 @@ class ChannelInformation:
         else:
             means = (components.mean, spread, draws)
             sky = joint.channel_sky(components.prior, number, information, *means, key)
-            common = partial(joint.sky_slopes, components.prior, number, information)
+            common = partial(joint.sky_slopes, components.prior, number, information, sky.lower)
         mean, covariance, drawn = sky.mean[:n], sky.covariance[:n, :n], sky.draws[:, :n]
         if tied is not None:
             unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)

@@ -135,8 +135,7 @@ class Potential(eqx.Module):
         Fixed sites are differentiated separately: a chart's matrices depend only on scales, and
         their products with every other direction would take longer than everything else.
         """
-        held = self.held()
-        unit = jnp.eye(x.shape[0])
+        held, unit = self.held(), jnp.eye(x.shape[0])
         _, derivative = jax.linearize(lambda x: f(x, True), x)
         rows = jax.lax.map(derivative, unit, batch_size=COLUMNS)
         if not len(held):

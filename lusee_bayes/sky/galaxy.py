@@ -461,8 +461,7 @@ class Slabs:
         stretch = np.minimum(1.0, TOP_KPC / DEPTH_KPC / np.maximum(sin_lat, 1e-9))
         nodes, weights = _nodes()
         emitted = np.empty((len(nodes), len(lon)))
-        column = np.empty((len(nodes), 2, len(lon)))
-        near = 0.0
+        column, near = np.empty((len(nodes), 2, len(lon))), 0.0
         for k, (node, weight) in enumerate(zip(nodes, weights, strict=True)):
             s, ds = node * stretch, weight * stretch
             along, z = s * cos_lat, s * sin_lat

@@ -118,10 +118,11 @@ def test_the_direct_solution_is_the_textbooks(case, place):
     np.testing.assert_allclose(found.log_evidence, evidence, rtol=1e-8)
     std = np.sqrt(np.diag(covariance)).reshape(-1, N_MODES)
     maps, draws = found.mean, found.sample(jax.random.key(3), 4000)
-    spread = joint.paired(found.covariance(), prior)
+    spread, slopes = joint.paired(found.covariance(), prior), []
     for k, information in enumerate(channels):
         rows = slice(k * N_MODES, (k + 1) * N_MODES)
         sky = joint.channel_sky(prior, k, information, maps, spread, draws, jax.random.key(5))
+        slopes.append(joint.sky_slopes(prior, k, on_host(information), sky.lower, np.eye(N_MODES)))
         # the textbook's own subtraction of s leaves 1e-16 times (signal / noise)^2
         assert np.abs((np.asarray(sky.mean) - mean[rows]) / std[k]).max() < 1e-6
         within(sky.covariance, covariance[rows, rows], 1e-7 * std[k].max() ** 2)
@@ -129,8 +130,7 @@ def test_the_direct_solution_is_the_textbooks(case, place):
         z = np.linalg.solve(lower, (np.asarray(sky.draws) - np.asarray(sky.mean)).T)
         assert np.abs(z @ z.T / 4000 - np.eye(N_MODES)).max() < z_of(81) * np.sqrt(2 / 4000)
     # of two channels: what they have of the component maps
-    given = [(prior, k, on_host(one), np.eye(N_MODES)) for k, one in enumerate(channels)]
-    seen = np.concatenate([joint.sky_slopes(*one) for one in given]) @ np.asarray(found.root())
+    seen = np.concatenate(slopes) @ np.asarray(found.root())
     others = np.kron(1.0 - np.eye(len(channels)), np.ones((N_MODES, N_MODES)))
     within(others * (seen @ seen.T), others * covariance, 1e-7 * std.max() ** 2)
 
