@@ -13,6 +13,8 @@ import lusee_bayes as lb
 
 def model(coupling, offset, prior, noise, data=None):
     """``prior``: the spectrum for A = 1 and tilt = 0."""
+    if not isinstance(prior, lb.HarmonicPrior):
+        raise lb.InputError("prior_amplitude needs a spectrum: use --set prior.model=isotropic")
     amplitude = numpyro.sample("amplitude", dist.LogNormal(0.0, 0.5))
     tilt = numpyro.sample("tilt", dist.Normal(0.0, 0.5))
     ell = jnp.arange(float(prior.spectrum.shape[0]))

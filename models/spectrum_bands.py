@@ -13,6 +13,8 @@ EDGES = np.array([1, 3, 6, 12, 24])
 
 def model(coupling, offset, prior, noise, data=None):
     """``prior``: the spectrum when all factors are one; ln of each factor is uncertain by 1."""
+    if not isinstance(prior, lb.HarmonicPrior):
+        raise lb.InputError("spectrum_bands needs a spectrum: use --set prior.model=isotropic")
     n_ells = prior.spectrum.shape[0]
     edges = EDGES[n_ells > EDGES]
     band = np.searchsorted(edges, np.arange(n_ells), side="right")

@@ -178,8 +178,9 @@ class DataOptions(ScenarioOptions):
     Attributes
     ----------
     data
-        Data to use: a file written by simulate or reduce, a luseepy waterfall, or session files of
-        lusee.ingest. If omitted, data are simulated from the scenario.
+        Data to use: a file written by simulate or reduce, one file of visibilities for each
+        frequency, a luseepy waterfall, or session files of lusee.ingest. If omitted, data are
+        simulated from the scenario.
     clock
         Clock reference (JSON), for sessions with no absolute time or to correct their UTC
         (flight.clock).

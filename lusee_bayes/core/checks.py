@@ -213,6 +213,12 @@ def number(value: Any, form: str = ".6g") -> str:
     return "traced" if is_traced(value) else format(float(value), form)
 
 
+def with_error(value: float, std: float) -> str:
+    """Format a value and its standard deviation, both to the second digit of the latter."""
+    digits = max(0, 1 - int(np.floor(np.log10(std)))) if std > 0.0 else 4
+    return f"{value:.{digits}f} +- {std:.{digits}f}"
+
+
 def extent(values: Any, unit: str, form: str = ".4g") -> str:
     """Format the range of some numbers, with their unit."""
     if is_traced(values):

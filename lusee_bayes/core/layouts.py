@@ -254,8 +254,7 @@ def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str
 
 def _checked_array(where: str, values: np.ndarray, declared: Variable, factor: float) -> np.ndarray:
     if declared.kind == "text":
-        texts = [_text(where, x, declared) for x in values.ravel()]
-        return np.array(texts).reshape(values.shape)
+        return np.array([_text(where, x, declared) for x in values.ravel()]).reshape(values.shape)
     if declared.kind == "time":
         if np.isnat(values).any():
             first = tuple(np.argwhere(np.isnat(values))[0].tolist())

@@ -295,8 +295,7 @@ def spanning_rows(
         k = int(squares.argmax())
         unit = residual[k] / np.sqrt(squares[k])
         # einsum, since the threads of BLAS would wait for each other every time
-        products = np.einsum("rc,c->r", residual, unit)
-        along.append(np.where(kind == kind[k], products, 0.0))
+        along.append(np.where(kind == kind[k], np.einsum("rc,c->r", residual, unit), 0.0))
         picked.append(k)
         residual -= along[-1][:, None] * unit
     coordinates = np.stack(along, axis=1)

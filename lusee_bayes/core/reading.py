@@ -214,8 +214,7 @@ def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
     ):
         if not isinstance(arrays, np.lib.npyio.NpzFile):
             raise InputError(f"{path} contains a single array; expected {layout.what}")
-        members = {name: _unloaded(arrays, name) for name in arrays.files}
-        return layout.checked(path, members, {})
+        return layout.checked(path, {name: _unloaded(arrays, name) for name in arrays.files}, {})
 
 
 def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:

@@ -118,13 +118,17 @@ def are_sessions(data: Data) -> bool:
     Raises
     ------
     InputError
-        If one of several files is not a session.
+        If several files are neither sessions nor visibilities.
     """
     files = files_of(data)
     sessions = [formats.is_session(require_file(path, "data", HINT)) for path in files]
-    if len(files) > 1 and not all(sessions):
-        odd = files[sessions.index(False)]
-        raise InputError(f"'{odd}' is not a spectrometer session; give other data as one file")
+    ours = [formats.format_of(path) == formats.VISIBILITIES for path in files]
+    alike = sessions if any(sessions) else ours
+    if len(files) > 1 and not all(alike):
+        raise InputError(
+            f"'{files[alike.index(False)]}' differs from the other files: several must all be "
+            "sessions of a spectrometer, or all visibilities of one frequency each"
+        )
     return bool(files) and all(sessions)
 
 
@@ -183,10 +187,9 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
         return visibilities_of(reduced, scenario)
     files, timestamp = files_of(data), scenario.observation.timestamp
     path = files[0] if files else "the data"
-    if not files:
-        data = _stamped(path, _nearest(items_of(data), scenario.frequency_mhz), timestamp)
-    elif not _is_waterfall(path):
-        data = _stamped(path, read_visibilities(path), timestamp)
+    if not files or not _is_waterfall(path):
+        sets = [read_visibilities(path) for path in files] or items_of(data)
+        data = _stamped(path, _nearest(sets, scenario.frequency_mhz), timestamp)
     else:
         waterfall = read_waterfall(path)
         data = waterfall.at(scenario.frequency_mhz, scenario.beam.source().n_ports)
@@ -215,12 +218,15 @@ def _is_waterfall(path: Path) -> bool:
 
 
 def _nearest(sets: Sequence[Visibilities], frequency_mhz: float) -> Visibilities:
-    """The only set, or the set at a frequency. InputError if there is none."""
-    apart = [abs(data.frequency_mhz - frequency_mhz) for data in sets]
-    if len(sets) > 1 and min(apart) > SAME_FREQUENCY_MHZ:
+    """The only set, or the set at a frequency. InputError if there is none, or several."""
+    near = [one for one in sets if abs(one.frequency_mhz - frequency_mhz) <= SAME_FREQUENCY_MHZ]
+    if len(sets) > 1 and len(near) != 1:
         mhz = ", ".join(f"{data.frequency_mhz:.9g}" for data in sets)
-        raise InputError(f"the data are at {mhz} MHz, none of them at {frequency_mhz:.15g} MHz")
-    return sets[int(np.argmin(apart))]
+        raise InputError(
+            f"the data are at {mhz} MHz, {len(near) or 'none'} of them at {frequency_mhz:.15g} "
+            "MHz; give one set of each frequency, and add more with map --add"
+        )
+    return sets[0] if len(sets) == 1 else near[0]
 
 
 def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) -> Visibilities:

@@ -188,8 +188,7 @@ def model_mistakes(setup: Setup) -> Iterator[ModelMistake]:
     _, m = mode_numbers(beams.lmax)
     mirrored = np.asarray(beams.modes) * np.where(m < 0, -1.0, 1.0)
     clockwise = np.asarray(turn_about_z(mirrored, np.pi / 2.0))
-    azimuths = {"mirrored": mirrored, "counted from North towards East": clockwise}
-    for how, modes in azimuths.items():
+    for how, modes in {"mirrored": mirrored, "counted from North towards East": clockwise}.items():
         wrong, remedy = f"the azimuth of the beams is {how}", "count it from East towards North"
         yield ModelMistake(wrong, remedy, replace(beams, modes=modes), observation)
     width = setup.scenario.noise.radiometer.bandwidth_hz / 1e6
@@ -516,15 +515,15 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     ]
     excess = EXPLAINED * abs(base.chi2 - base.degrees)
     nearly = [one for one in proposals if one.excess < excess and not one.chi2.too_small]
-    # these always absorb part of any misfit, and count only if they absorb all of it
-    proposals += _noise_level(residuals, data)
     others = list(_correlated_noise(judge))
     suffice = [one for one in (*proposals, *others) if one.suffices(base)]
-    if not suffice:
-        others += (finer := list(_finer(judge)))
-        suffice = [one for one in finer if one.suffices(base)]
+    # these always absorb part of any misfit, and count only if they absorb all of it
+    for absorbing in (_finer(judge), _noise_level(residuals, data)):
+        if not suffice:
+            others += (last := list(absorbing))
+            suffice = [one for one in last if one.suffices(base)]
     listed = sorted(suffice or ([] if base.fits else nearly), key=lambda one: one.excess)
-    return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + 1 + len(others))
+    return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + len(others))
 
 
 def _correlated_noise(judge: UnderAnySky) -> Iterator[Proposal]:

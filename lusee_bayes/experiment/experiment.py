@@ -215,8 +215,7 @@ def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
         If the source has no sky at this frequency, or not up to the scenario's lmax.
     """
     scenario = setup.scenario.model_copy(update={"seed": seed})
-    sky = source.at(scenario.frequency_mhz, scenario.lmax)
-    seen = replace(setup.under(sky), scenario=scenario)
+    seen = replace(setup.under(source.at(scenario.frequency_mhz, scenario.lmax)), scenario=scenario)
     if seen.above is not None:
         whole = source.at(scenario.frequency_mhz, scenario.noise.above_lmax.top(scenario.lmax))
         modes = np.asarray(whole.modes)[seen.prior.size :]
@@ -389,7 +388,7 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
             f"The prior was learned with N times {learned.noise_factor:.2g}, to match residual "
             "chi2; the map uses the scenario's N."
         )
-    for name, gain in ({} if learned is None else learned.survey_gains).items():
+    for name, gain in () if learned is None else learned.survey_gains:
         if gain < 0.0:
             notes.append(
                 f"{name} does not agree with the data: ln p(d) is {-gain:.3g} higher without it."

@@ -81,8 +81,7 @@ def set_up(
         if scenario.noise.regolith is not None:
             ground_per_kelvin(source, scenario.frequency_mhz)  # refuses beams without a ground
         if (noise := scenario.noise.receiver) is not None:
-            autos = auto_indices(source.n_ports)
-            background[autos] += noise.powers(source, scenario.frequency_mhz)
+            background[auto_indices(source.n_ports)] += noise.powers(source, scenario.frequency_mhz)
         responses = source_responses(scenario, observation, source, scenario.frequency_mhz)
     if data is not None and data.layout.n_products != beams.n_products:
         raise InputError(
@@ -336,8 +335,7 @@ def true_values(setup: Setup) -> Truth:
     """True values of the systematics in simulated data, by the names of their sites."""
     truth: Truth = {}
     for cls, section in present(setup.scenario):
-        key = jax.random.key(cls.true_seed(section, setup.scenario))
-        truth |= cls.truth(section, setup, key)
+        truth |= cls.truth(section, setup, jax.random.key(cls.true_seed(section, setup.scenario)))
     return truth
 
 

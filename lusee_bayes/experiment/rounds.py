@@ -593,7 +593,7 @@ def _compared_surveys(setup: Setup, information: Information, learned: Learned) 
     _, alone = under()
     fitting = information.raised(alone.noise_factor)
     others = fitting.posterior(alone.prior)
-    rows, gains = [], {}
+    rows, gains = [], []
     for one in setup.scenario.prior.surveys:
         family, known = under(one)
         start = known.parameters if known.settled else family.hyperprior.start()
@@ -601,8 +601,8 @@ def _compared_surveys(setup: Setup, information: Information, learned: Learned) 
         errors = family.at(start).texture + family.white * np.eye(n)
         rows += survey.calibrated(others.mean, others.covariance(), errors)
         gained = fitting.posterior(known.prior).log_evidence - others.log_evidence
-        gains[survey.name] = float(gained)
-    return replace(learned, survey_rows=tuple(rows), survey_gains=gains)
+        gains.append((survey.name, float(gained)))
+    return replace(learned, survey_rows=tuple(rows), survey_gains=tuple(gains))
 
 
 def _with_surveys(setup: Setup, surveys: Sequence[sky_sections.SurveySection]) -> Setup:

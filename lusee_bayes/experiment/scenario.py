@@ -92,6 +92,7 @@ def one_sentence(error: ValidationError, source: str | Path) -> str:
         # pydantic's message names the class
         expected = "it should be a section with keys; lusee-bayes keys lists them"
     # YAML has lists where sections have tuples
+    expected = expected.replace("a valid tuple", "a list")
     got = list(first["input"]) if isinstance(first["input"], tuple) else first["input"]
     return f"{source}: {where} is {got!r}, but {expected}{more}"
 

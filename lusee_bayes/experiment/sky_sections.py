@@ -109,7 +109,7 @@ class SurveySection(Section):
     zero_std_k : float
         Prior standard deviation of its zero level b, in K at its own frequency.
     mask_file : str
-        HEALPix FITS map of the same NSIDE: 0 where the survey is not to be used.
+        HEALPix FITS map of the same NSIDE: 0 or UNSEEN where the survey is not to be used.
     """
 
     file: str
@@ -138,7 +138,7 @@ class SurveySection(Section):
                 path = require_file(self.mask_file, "mask", "check prior.surveys")
                 mask = sky_source.SkyMap.read(path)
                 require_shape(f"{self.mask_file}: the mask", mask.pixels, gaps.shape)
-                gaps = gaps | (mask.pixels == 0.0)
+                gaps = gaps | mask.unseen | (mask.pixels == 0.0)
             if gaps.all() or not sky.pixels[~gaps].mean() > 0.0:
                 raise InputError(
                     f"{self.file}: the mean of its pixels must be positive, and not all of them "
@@ -159,7 +159,8 @@ class SurveySection(Section):
         factor = (frequency_mhz / self.frequency_mhz) ** self.index
         modes = factor * sky.modes_at(self.frequency_mhz, lmax)
         widths = self.scale_std, factor * self.zero_std_k
-        return Survey(Path(self.file).name, modes, beam, *widths, unseen)
+        name = f"{Path(self.file).name} at {self.frequency_mhz:g} MHz"
+        return Survey(name, modes, beam, *widths, unseen)
 
 
 SKY_SECTIONS = kinds_of(GalaxySection, FileSkySection)

@@ -29,6 +29,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, Square, Vector
+from lusee_bayes.core.checks import with_error
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, true_values
@@ -174,7 +175,7 @@ class UnknownsReport:
 def _line(name: str, row: Mapping[str, Any]) -> str:
     """Format a row of a table as text."""
     unit = f" {row['unit']}" if row.get("unit") else ""
-    text = f"{name}: {row['value']:.4g} +- {row['std']:.2g}{unit}"
+    text = f"{name}: {with_error(row['value'], row['std'])}{unit}"
     if row["std"] > UNTOLD * row["prior_std"]:
         text += f" (unconstrained: prior +- {row['prior_std']:.2g})"
     return text
@@ -610,8 +611,7 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     table = pd.DataFrame(blocks, columns=["source", "block"])
     table["above_horizon"] = np.asarray(held.systematic.columns).any(0)
     in_jy = fluxes.filter(["prior", "prior_std", "true"]) / kelvin_steradian(1.0, frequency_mhz)
-    found = in_both_units(fluxes, frequency_mhz)
-    return pd.concat([table, found, in_jy.add_suffix("_jy")], axis=1)
+    return pd.concat([table, in_both_units(fluxes, frequency_mhz), in_jy.add_suffix("_jy")], axis=1)
 
 
 def in_both_units(unknowns: pd.DataFrame, frequency_mhz: float) -> pd.DataFrame:
@@ -626,7 +626,7 @@ def flux_lines(fluxes: pd.DataFrame) -> Iterator[str]:
     """One line per source, or per block of it."""
     for row in fluxes.to_dict("records"):
         name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"
-        text = f"{name}: {row['flux_jy']:.4g} +- {row['std_jy']:.2g} Jy"
+        text = f"{name}: {with_error(row['flux_jy'], row['std_jy'])} Jy"
         if not row["above_horizon"]:
             text += " (prior: never above the horizon)"
         yield text

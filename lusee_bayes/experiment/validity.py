@@ -230,21 +230,21 @@ def blind_spots(
     return tuple(spots)
 
 
-def about_sky_above(setup: Setup) -> str:
-    """Effect of the sky above lmax on the data, and the lmax that suffices; empty if negligible."""
+def about_sky_above(setup: Setup) -> list[str]:
+    """A sentence on the sky above lmax in the data, and the lmax that suffices; none if small."""
     above, section, n_data = setup.above, setup.scenario.noise.above_lmax, setup.layout.size
     if above is None or section.treatment == "ignored":
-        return ""
+        return []
     if (added := float(np.sqrt(above.power.sum() / n_data))) < LITTLE:
-        return ""
+        return []
     lmax, above_ell = setup.scenario.lmax, np.append(np.cumsum(above.power[::-1])[::-1], 0.0)
     enough = lmax + int(np.argmax(above_ell < np.sqrt(2.0 * n_data)))
-    return (
+    return [
         f"The sky above lmax = {lmax} adds about {added:.2g} standard deviations of the noise to "
         "every datum (rms). It is marginalised, which makes error bars larger. Above lmax = "
         f"{enough} it would add less to chi2 than chance. Simulations may end at lmax: then use "
         "noise.above_lmax.treatment=ignored."
-    )
+    ]
 
 
 def reach(experiment: Experiment, inference: Inference) -> list[str]:
@@ -267,7 +267,6 @@ def reach(experiment: Experiment, inference: Inference) -> list[str]:
             f"standard deviations (rms), so that {holds}; treatment=sampled avoids the Gaussian "
             "approximation."
         )
-    sentences += filter(None, [about_sky_above(setup)])
     if setup.measured:
         spots = blind_spots(setup, inference, inference.posterior.mean, pointing=False)
         sentences += filter(None, [blind_sentence(spots)])

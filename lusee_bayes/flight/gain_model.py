@@ -88,8 +88,7 @@ class GainModel(Described):
         )
 
     def __post_init__(self):
-        terms = (*LEAD, N_COMPONENTS, N_TERMS)
-        require_shape(f"{self.path}: coefficient", self.coefficient, terms)
+        require_shape(f"{self.path}: coefficient", self.coefficient, (*LEAD, N_COMPONENTS, N_TERMS))
         if not (np.diff(self.anchor_mhz, axis=2) > 0.0).all():
             raise InputError(f"{self.path}: the frequencies of the gains do not increase")
         require_mhz(f"{self.path}: the frequencies of the gains", self.anchor_mhz)

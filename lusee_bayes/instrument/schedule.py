@@ -168,8 +168,7 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> list[Cut]:
         begins = step_s * np.arange(interval.n_samples(step_s))
         length = np.diff(begins, append=interval.length_s)
         start = times.seconds_from(intervals[0].start_time, interval.start_time) + begins
-        samples = np.stack([start, length, interval.duty_cycle * length])
-        cuts.append(Cut(samples, interval, name))
+        cuts.append(Cut(np.stack([start, length, interval.duty_cycle * length]), interval, name))
     return cuts
 
 

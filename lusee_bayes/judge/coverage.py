@@ -146,8 +146,7 @@ def multipoles(lmax: int) -> dict[str, Bool[np.ndarray, " modes"]]:
     """Which modes are in each group of multipoles."""
     ell, _ = mode_numbers(lmax)
     first = [edge for edge in ELLS if edge <= lmax]
-    last = [*(edge - 1 for edge in first[1:]), lmax]
     return {
         f"ell {low} to {high}" if high > low else f"ell {low}": (ell >= low) & (ell <= high)
-        for low, high in zip(first, last, strict=True)
+        for low, high in zip(first, [*(edge - 1 for edge in first[1:]), lmax], strict=True)
     }

@@ -152,7 +152,10 @@ class ChannelFits:
 
     def _advice(self, level: Level) -> list[str]:
         if level == "does not fit" and self._too_quiet():
-            return ["The assumed noise (noise.radiometer) is too large: error bars are too wide."]
+            return [
+                "The assumed noise (noise.radiometer) is too large, or the data lack the sky above "
+                "lmax that the model expects (noise.above_lmax)."
+            ]
         if level == "does not fit":
             return ["Map the flagged channels one by one: this also tests their products and days."]
         if level == "unlike the prior" and self.prior.too_small:

@@ -162,8 +162,7 @@ class AmplitudesOfSky:
             solved = np.asarray(factor.solve(t))
             covariance = np.eye(t.shape[1]) - t.T @ solved
         pull = np.asarray(model.coupling.transpose_mv(np.asarray(solved))).T
-        mean = t.T @ solution.weighted_residual()
-        return cls(mean, pull, covariance, solution.posterior.mean)
+        return cls(t.T @ solution.weighted_residual(), pull, covariance, solution.posterior.mean)
 
     def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
         """Integrate out a sky N(mean, covariance), in K and K^2, given any additional data."""

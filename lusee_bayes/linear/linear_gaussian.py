@@ -306,8 +306,7 @@ class Solution(Described):
         Multiplied by T^T, it gives the mean of templates' amplitudes; multiplied by a term N_0 of
         N, the mean of this term's part of the data.
         """
-        residual = self.data - self.model.predict(self.posterior.mean)
-        return np.asarray(self.factor.solve(residual))
+        return np.asarray(self.factor.solve(self.data - self.model.predict(self.posterior.mean)))
 
     def less(self, excess: float) -> Solution:
         """The same, with chi^2 and -2 ln p(d) lower by a number."""

@@ -111,8 +111,7 @@ def of_one_angle(
     for order in range(n):
         start, stop = np.searchsorted(m, (order, order + 1))
         column = (s * (order + 1) + m) * n + ell
-        rows = _rows_of_order(order, beams, f)
-        whole[start:stop, :stop] = rows[: stop - start, column[:stop]]
+        whole[start:stop, :stop] = _rows_of_order(order, beams, f)[: stop - start, column[:stop]]
     return whole
 
 

@@ -289,6 +289,7 @@ def _covariance(posterior: Posterior) -> tuple[Float[Array, "unknowns unknowns"]
     else:
         half = solve_lower(posterior.lower, posterior.basis.T, transpose=False)
         white = half.T @ half + xp.eye(rank) - posterior.basis @ posterior.basis.T
+    # colouring overwrites
     rounding = _rounding(posterior, xp.diagonal(white))
     return posterior.prior.colour_covariance(white), rounding
 

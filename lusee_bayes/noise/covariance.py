@@ -414,8 +414,7 @@ class LowRankUpdate(Covariance):
         base = self.base.factor() if base is None else base
         v = base.whiten(self.update.root)
         small = np.eye(v.shape[1]) + v.T @ v
-        lower = checked_cholesky(f"1 + V^T V of {self.update.name}", small)
-        return LowRankFactor(base, v, lower)
+        return LowRankFactor(base, v, checked_cholesky(f"1 + V^T V of {self.update.name}", small))
 
     def absorb(self, other):
         if isinstance(other, LowRankUpdate):

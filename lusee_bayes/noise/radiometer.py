@@ -72,7 +72,7 @@ Scalar = float | int | Float[Array, ""]
 
 RADIOMETER_FORMS = ("paper", "exact")
 # smallest eigenvalue of T over the largest: that of the products' covariance is about its square
-LEAST_EIGENVALUE = 1e-6
+LEAST_EIGENVALUE = 1e-4
 
 
 def radiometer_noise(

@@ -136,8 +136,7 @@ class Hyperprior:
         theta = np.sign(x) * -special.stdtrit(FREEDOM, special.ndtr(-np.abs(x)))
         above = special.gammainccinv(SHAPE, special.ndtr(t))
         below = special.gammaincinv(SHAPE, special.ndtr(-t))
-        power = np.where(t < 0, above, below)
-        cells = -np.log(power / SHAPE) / STEEPNESS
+        cells = -np.log(np.where(t < 0, above, below) / SHAPE) / STEEPNESS
         return np.concatenate([self.centre + self.width * theta, cells], axis=-1)
 
     def near(self, scores: Parameters, drawn: Scored) -> Scored:

@@ -16,10 +16,11 @@ curvature is the Fisher information, estimated from simulated data, plus the hyp
 by how the gradient has changed along earlier steps.
 Around the maximum we assume that z is normal, and theta linear in z. Cells' factors are different:
 their distribution is skewed, and the mean factor of an unobserved cell is far above the most
-probable one. The returned prior has the mean variances over this distribution, at the level that
-suits the data best: the data constrain the mean variance over many cells, which the most probable
-logarithms do not give. The evidence is Laplace's approximation to the integral of p(d, theta), in
-normal scores, which account for the hyperprior's tails.
+probable one. The returned prior has the mean variances over this distribution (their roots within
+4 %: a cell's own spread beside that of its neighbours is neglected), at the level that suits the
+data best: the data constrain the mean variance over many cells, which the most probable logarithms
+do not give. The evidence is Laplace's approximation to the integral of p(d, theta), in normal
+scores, which account for the hyperprior's tails.
 
 Draws of a sky include the uncertainty of the parameters, ::
 
@@ -34,7 +35,7 @@ each S(theta(z)).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -173,8 +174,8 @@ class Learned:
         and N are inferred together; 0 once they have converged.
     survey_rows : tuple of dict
         Name, value and standard deviation of the surveys' parameters.
-    survey_gains : mapping of float
-        Increase of ln p(d) due to each survey alone, by its name.
+    survey_gains : tuple of (str, float)
+        Name of each survey, and the increase of ln p(d) due to it alone.
     """
 
     prior: Prior
@@ -186,7 +187,7 @@ class Learned:
     settled: bool = field(default=True, kw_only=True)
     still_moves: float = field(default=0.0, kw_only=True)
     survey_rows: tuple[Row, ...] = field(default=(), kw_only=True)
-    survey_gains: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    survey_gains: tuple[tuple[str, float], ...] = field(default=(), kw_only=True)
 
     def as_rows(self) -> list[Row]:
         """Name, value and standard deviation of the named parameters, and of surveys."""

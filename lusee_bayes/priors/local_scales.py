@@ -115,8 +115,7 @@ class Band:
         at = np.tile(np.arange(len(theta)), 4)
         cells = sparse.csr_array((weight.ravel(), (at, near.ravel())), (len(theta), N_CELLS))
         tilts = np.log((_middle(window) + 1.0) / PIVOT) * np.column_stack([seen, plane])
-        covariates = np.column_stack([seen, clear - seen, plane, tilts, field])
-        return cls(window, grid, covariates, cells)
+        return cls(window, grid, np.column_stack([seen, clear - seen, plane, tilts, field]), cells)
 
 
 def windows(lmax: int) -> Float[np.ndarray, "bands ells"]:

@@ -94,8 +94,10 @@ class Survey:
         whole = scaled(covariance + errors, self.beam, overwrite=True) + gram_matrix(self.shapes)
         if self.unseen is not None:
             whole += self._blind()
-        root = checked_cholesky("the covariance of a survey", whole)
-        half = solve_lower(root, np.stack([off, *self.shapes]).T, transpose=False)
+        # white errors of a wide beam's map would be its whole content on small scales
+        n = int((self.beam > LEAST_BEAM).sum())
+        root = checked_cholesky("the covariance of a survey", whole[:n, :n])
+        half = solve_lower(root, np.stack([off, *self.shapes]).T[:n], transpose=False)
         # unknowns 1 / a - 1 and -b / a
         widths = np.array([self.scale_std, self.zero_std])
         shift = -widths * (half[:, 1:].T @ half[:, 0])
@@ -104,7 +106,7 @@ class Survey:
         # a and b by these unknowns
         slopes = np.array([[-(scale**2), 0.0], [shift[1] * scale**2, -scale]])
         std = np.sqrt(np.diagonal(slopes @ covariance @ slopes.T))
-        values = {"scale": scale, "zero level (K)": -shift[1] * scale}
+        values = {"scale": scale, "zero level (K at the map's frequency)": -shift[1] * scale}
         return [
             {"name": f"{name} of {self.name}", "value": float(value), "std": float(width)}
             for (name, value), width in zip(values.items(), std, strict=True)

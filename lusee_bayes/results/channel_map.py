@@ -25,7 +25,7 @@ from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, doubts, infer, posterior_draws, rounds_of
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
-from lusee_bayes.experiment.validity import reach
+from lusee_bayes.experiment.validity import about_sky_above, reach
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge import measures
 from lusee_bayes.judge.coverage import N_DRAWS, Counts
@@ -278,6 +278,8 @@ class Conditioned:
             with stages("clock and pointing"):
                 pointing = pointing_report(experiment, inference)
         doubtful = list(doubts(experiment, inference))
+        if left is not None:
+            doubtful += about_sky_above(experiment.setup)
         if alone:
             with stages("first order"):
                 doubtful += reach(experiment, inference)

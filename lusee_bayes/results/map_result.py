@@ -18,7 +18,7 @@ from astropy.table import Table
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import Described, counted, extent
+from lusee_bayes.core.checks import Described, counted, extent, with_error
 from lusee_bayes.core.harmonics import synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import about_run
@@ -41,7 +41,7 @@ def prior_sentence(experiment: Experiment) -> str:
     """The prior's model, the source of its C_ell and, if it was learned, its parameters."""
     section, prior = experiment.scenario.prior, experiment.learned
     rows = [] if prior is None else prior.as_rows()
-    learned = ", ".join(f"{r['name']}: {r['value']:.4g} +- {r['std']:.2g}" for r in rows)
+    learned = ", ".join(f"{r['name']}: {with_error(r['value'], r['std'])}" for r in rows)
     return f"Prior {section.model}, C_ell {section.origin}{'; ' if rows else ''}{learned}."
 
 

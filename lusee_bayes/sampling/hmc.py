@@ -17,6 +17,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -275,29 +276,31 @@ class Checkpoints:
         self.folder = Path(folder)
         described = json.loads(json.dumps(identity))
         marker, paths = self.folder / IDENTITY, self._paths()
-        if not marker.exists():
-            if paths:
-                raise InputError(
-                    f"'{self.folder}' contains draws, but no {IDENTITY} to identify the run; "
-                    "delete the folder"
-                )
+        if not paths:
             with replacing(marker) as scratch:
                 scratch.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
             return
-        if not resume:
-            done = _iteration(paths[-1]) if paths else "no"
+        if not marker.exists():
             raise InputError(
-                f"'{self.folder}' contains an unfinished run ({done} iterations done); continue "
-                "with --resume, or delete the folder"
+                f"'{self.folder}' contains draws, but no {IDENTITY} to identify the run; delete "
+                "the folder"
+            )
+        if not resume:
+            raise InputError(
+                f"'{self.folder}' contains an unfinished run ({_iteration(paths[-1])} iterations "
+                "done); continue with --resume, or delete the folder"
             )
         saved = read_model(marker, dict, WHAT)
-        for name in sorted({*saved, *described}):
-            if saved.get(name) != described.get(name):
-                raise InputError(
-                    f"the unfinished run in '{self.folder}' has another {name}: "
-                    f"{saved.get(name)!s:.40}, now {described.get(name)!s:.40}; resume it with the "
-                    "same value, or delete the folder"
-                )
+        # another scenario simulates other data: it is named first
+        for name in sorted({*saved, *described}, key=lambda name: (name != "scenario", name)):
+            before, now = (str(one.get(name)).splitlines() for one in (saved, described))
+            for was, line in zip_longest(before, now, fillvalue="nothing"):
+                if was != line:
+                    raise InputError(
+                        f"the unfinished run in '{self.folder}' has another {name}: "
+                        f"{was.strip():.60}, now {line.strip():.60}; resume it with the same "
+                        "value, or delete the folder"
+                    )
 
     def _paths(self) -> list[Path]:
         return sorted(self.folder.glob(CHUNK_GLOB))
@@ -441,8 +444,7 @@ class CrankNicolson(MCMCKernel):
         given = self.model, model_args, model_kwargs
 
         def sites(z: dict[str, Array]) -> dict[str, Array]:
-            site = {self.site: z[self.site]}
-            return z | constrain_fn(*given, site, return_deterministic=True)
+            return z | constrain_fn(*given, {self.site: z[self.site]}, return_deterministic=True)
 
         return sites
 

@@ -344,8 +344,7 @@ def _climb(
     x, value, _, moved, root, _, n = jax.lax.while_loop(going, step, start)
     log_det = jnp.linalg.slogdet(root)[1]
     whitening = Whitening(x, root, log_det, problem.shapes.sites, problem.shapes.chart)
-    log_evidence = -value + log_det + x.shape[0] * HALF_LOG_2PI
-    return LaplaceApproximation(whitening, log_evidence, moved, n)
+    return LaplaceApproximation(whitening, -value + log_det + x.shape[0] * HALF_LOG_2PI, moved, n)
 
 
 # degrees of freedom of the proposal, whose tails are heavier than a Gaussian's

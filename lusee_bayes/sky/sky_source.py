@@ -203,7 +203,7 @@ class SkyMap(SkyFile):
     @property
     def unseen(self) -> Bool[np.ndarray, " pixels"]:
         """Which pixels have no data."""
-        return self.pixels == UNSEEN
+        return np.isclose(self.pixels, UNSEEN, rtol=1e-6)
 
     def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
         if self.unseen.any():
@@ -238,7 +238,7 @@ def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
         if dataset not in names:
             raise InputError(
                 f"{path} has no dataset '{dataset}' (it has {', '.join(sorted(names))}); "
-                f"{nearest(dataset, names)} Set sky.dataset"
+                f"{nearest(dataset, names)} Set the key dataset"
             )
         units = {f"{dataset}.units": file[dataset].attrs.get("units")}
         return _layout(dataset).checked(path, {dataset: file[dataset]}, units).arrays[dataset]
@@ -355,8 +355,8 @@ class SkyAlms(SkyFile):
             if not np.isclose(mhz[channel], frequency_mhz, rtol=1e-9):
                 raise InputError(
                     f"{self.path} has no coefficients at {frequency_mhz:g} MHz (it has "
-                    f"{', '.join(f'{f:g}' for f in mhz)}); set sky.file_frequency_mhz to one of "
-                    "those, to scale them with sky.spectral_index"
+                    f"{', '.join(f'{f:g}' for f in mhz)}); read it at one of those: "
+                    "sky.file_frequency_mhz (and sky.spectral_index), or a survey's frequency_mhz"
                 )
         return self.modes[channel, : harmonics.n_modes(lmax)]
 
@@ -498,8 +498,8 @@ class SkyCube(SkyFile):
         if not mhz[0] <= frequency_mhz <= mhz[-1]:
             raise InputError(
                 f"{self.path} has maps from {mhz[0]:g} to {mhz[-1]:g} MHz, not at "
-                f"{frequency_mhz:g}; set sky.file_frequency_mhz to one of those, to scale it with "
-                "sky.spectral_index"
+                f"{frequency_mhz:g}; read it at one of those: sky.file_frequency_mhz (and "
+                "sky.spectral_index), or a survey's frequency_mhz"
             )
         above = int(np.searchsorted(mhz, frequency_mhz))
         if mhz[above] == frequency_mhz:

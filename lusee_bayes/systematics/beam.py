@@ -137,8 +137,7 @@ def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[Beam
         # with the same receivers, and turned like the scenario's
         other = setup.scenario.beam.of_file(section.file).source()
         return other.behind(setup.receiver), frequency_mhz
-    chosen = {name: values[name] for name in section.parameters}
-    return source.with_values(chosen), frequency_mhz
+    return source.with_values({name: values[name] for name in section.parameters}), frequency_mhz
 
 
 def difference_of_beams(section: BeamErrorSection, setup: Setup, values: Values) -> BeamModes:
@@ -230,9 +229,9 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
 
 
 def beam_rms_difference(setup: Setup) -> float | None:
-    """RMS difference of the true and the model's beams, over the model's; None if the same."""
+    """RMS difference of the true and the model's beams, over the model's; None if unknown."""
     section = setup.scenario.noise.beam
-    if section is None:
+    if section is None or setup.measured:
         return None
     key = jax.random.key(BeamErrors.true_seed(section, setup.scenario))
     true = BeamErrors.moved(section, setup, BeamErrors.truth(section, setup, key))

@@ -202,8 +202,7 @@ class GainDrifts(Systematic):
         """Multiply by one draw of the drifts."""
         drift = GainDrift(truth["gain_sigma"], truth["gain_correlation_h"])
         gains = drift.sample(cls.own_key(key), setup.observation.hours)
-        response = cls.build(section, setup, Around()).response(gains)
-        return multiplied(model, np.asarray(response))
+        return multiplied(model, np.asarray(cls.build(section, setup, Around()).response(gains)))
 
     @property
     def n_antennas(self) -> int:

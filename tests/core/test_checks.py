@@ -44,8 +44,7 @@ def test_other_shapes_are_refused_with_both_shapes(shape, said):
 def test_non_finite_entries_are_counted_and_the_first_three_located(bad):
     x = np.ones((2, 5))
     x[1, 3] = x[1, 4] = bad
-    words = "x: NaN or infinity (2 of 10 entries, first at (1, 3), (1, 4))"
-    refuse(words, require_finite, "x", x)
+    refuse("x: NaN or infinity (2 of 10 entries, first at (1, 3), (1, 4))", require_finite, "x", x)
     refuse(r"5 of 5.*\(0,\), \(1,\), \(2,\)\)", require_finite, "x", np.full(5, bad))
 
 

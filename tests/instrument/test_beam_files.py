@@ -17,7 +17,7 @@ from reference import hemisphere, real_harmonics
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import moved, set_up, true_signal, true_values
-from lusee_bayes.instrument.beams.fields import HemisphereGrid, product_beams
+from lusee_bayes.instrument.beams.fields import HemisphereGrid, ProductBeams, product_modes
 from lusee_bayes.instrument.beams.luseepy_files import FIELD_NAMES, parts_of
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.beams.sampled import read_beam
@@ -54,7 +54,8 @@ def visibilities(luseepy, frequency, grid=None, **options) -> np.ndarray:
     if grid is None:
         beams = beam.beams(frequency, LMAX)
     else:
-        beams = product_beams(beam.fields(frequency, grid), frequency, LMAX, normalise=False)
+        modes = product_modes(beam.fields(frequency, grid), LMAX, normalise=False)
+        beams = ProductBeams(modes, frequency)
     return np.asarray(lb.CouplingMatrix.build(beams, pointing) @ sky[frequency]).reshape(16, -1)
 
 

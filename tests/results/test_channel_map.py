@@ -50,8 +50,9 @@ NOISES = ["noise.gain={sigma: 0.01}"], ["noise.radiometer.form=exact", "noise.be
 def test_likelihoods_of_draws_are_those_of_matrices(noise):
     made, channel = mapped(small_experiment("output.draws=4", *noise))
     expected = dense_log_likelihood(made.from_data.model, made.experiment.data.data, channel.draws)
-    # data of 1e5 standard deviations
-    np.testing.assert_allclose(channel.log_likelihood, expected, atol=1e-6)
+    # the rounding of N^-1, times chi^2
+    rounding = np.linalg.cond(np.asarray(made.from_data.model.noise.dense())) * 1e-15 * 100
+    np.testing.assert_allclose(channel.log_likelihood, expected, atol=rounding)
     assert len(expected) == 4 and np.ptp(expected) > 0.1
 
 

@@ -15,7 +15,7 @@ In the first ring orders 3 alias to orders 1, by (h l)^3 / 43 of the pattern the
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
@@ -211,7 +211,7 @@ def neighbours(path: str, known_mhz: Frequencies, frequency_mhz: float) -> list[
         return [(nearest, 1.0)]
     if not known_mhz[0] < frequency_mhz < known_mhz[-1]:
         raise InputError(
-            f"{path} has values from {known_mhz[0]:g} to {known_mhz[-1]:g} MHz, not at "
+            f"{path}: frequencies from {known_mhz[0]:g} to {known_mhz[-1]:g} MHz, not at "
             f"{frequency_mhz:.12g}; change frequency_mhz, or give a file that covers it"
         )
     above = int(np.searchsorted(known_mhz, frequency_mhz))
@@ -387,31 +387,6 @@ class ProductBeams(checks.Described, eqx.Module):
     def labels(self) -> tuple[str, ...]:
         """Labels of the products, in order."""
         return labels_of(self.n_products)
-
-
-def product_beams(
-    fields: AntennaFields, frequency_mhz: float, lmax: int, **options: Any
-) -> ProductBeams:
-    """Return the beams of all products of the antennas.
-
-    Parameters
-    ----------
-    fields : AntennaFields
-    frequency_mhz : float
-    lmax : int
-    **options
-        ``stokes`` and ``normalise``, as for :func:`product_modes`.
-
-    Returns
-    -------
-    ProductBeams
-
-    Raises
-    ------
-    InputError
-        As :func:`product_modes`.
-    """
-    return ProductBeams(product_modes(fields, lmax, **options), float(frequency_mhz))
 
 
 def product_modes(

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, Values, namespace
-from lusee_bayes.core.checks import Described, is_traced
+from lusee_bayes.core.checks import Described, is_traced, listed
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import interpolate
@@ -145,8 +145,8 @@ class GridBeams(Described, BeamSource):
         """Return errors of beams that are interpolated without their own file.
 
         For each inner value of a parameter: the beams interpolated along this parameter from its
-        other values, minus those of the files. This exceeds the error of the whole grid, whose
-        polynomials have one degree more, or half the step.
+        other values, minus those of the files. This usually exceeds the error of the whole grid,
+        whose polynomials have one degree more, or half the step; with three values it may be half.
         """
         nodes, errors = self._at_nodes(frequency_mhz, lmax)[..., :-1], {}
         whole = nodes.reshape(*map(len, self.axes.values()), *nodes.shape[1:])
@@ -223,7 +223,10 @@ def read_beam_grid(
     """
     files, axes = read_grid_table(path)
     middle = {name: float(xs[0] + xs[-1]) / 2.0 for name, xs in axes.items()}
-    grid = GridBeams(str(path), axes, tuple(map(read, files)), middle, middle)
+    sources = tuple(map(read, files))
+    if len(ports_of := {source.n_ports for source in sources}) > 1:
+        raise InputError(f"{path}: the files have {listed(ports_of)} ports; expected one number")
+    grid = GridBeams(str(path), axes, sources, middle, middle)
     grid = grid.with_values(values or {})
     return replace(grid, nominal=grid.values)
 

@@ -142,8 +142,7 @@ class BandLimitedGrid(HemisphereGrid):
         summed = np.empty((n, polar.shape[1]))
         for parity in (0, 1):
             same = m % 2 == parity
-            cardinal = cardinal_functions(fine, 2 * n - 2, parity)[:, :n]
-            summed[:, same] = cardinal.T @ polar[:, same]
+            summed[:, same] = cardinal_functions(fine, 2 * n - 2, parity)[:, :n].T @ polar[:, same]
         summed[-1] /= 2.0
         return summed
 
@@ -272,7 +271,8 @@ class LuseepyBeam(Described, BeamSource):
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         # these nodes treat the cut at the horizon exactly
-        exact = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+        rings, azimuths = 2 * max(len(self.theta), lmax + 1), max(self.n_phi, 2 * lmax + 2)
+        exact = HemisphereGrid.gauss_legendre(rings, azimuths)
         grid = self.luseepy_grid() if self.luseepy_quadrature else exact
         if self.interpolation == "spline":
             weighted = [(1.0, self.fields(frequency_mhz, grid))]

@@ -393,8 +393,7 @@ def _patterns(
     theta, phi = xp.arctan2(xp.hypot(east, north), up), xp.arctan2(north, east)
     patterns = to_real(stokes_pairs(*monopoles.towards(frequency_mhz, theta, phi), stokes))
     # the autos' integral is converged on the coarsest grid
-    grid = HemisphereGrid.for_lmax(0)
-    scale = mean_auto_integral(monopoles.fields(frequency_mhz, grid))
+    scale = mean_auto_integral(monopoles.fields(frequency_mhz, HemisphereGrid.for_lmax(0)))
     return xp.where(visible[None], patterns / scale, 0.0)
 
 

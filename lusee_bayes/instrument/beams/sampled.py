@@ -105,7 +105,8 @@ class Directions:
                 )
             return cls(None, 0, healpy.npix2nside(n_last))
         used = theta[theta < 90.0 - ANGLE_TOLERANCE]
-        if len(used) < 4 or max(used[0], 90.0 - used[-1]) > np.diff(theta)[: len(used)].max():
+        step = np.diff(theta)[: len(used)].max(initial=0.0) + ANGLE_TOLERANCE
+        if len(used) < 4 or max(used[0], 90.0 - used[-1]) > step:
             raise InputError(
                 f"{path}: theta_deg runs from {theta[0]:g} to {theta[-1]:g} in {len(theta)} steps, "
                 "expected at least four angles from the zenith (0) to the horizon (90)"

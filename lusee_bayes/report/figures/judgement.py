@@ -9,6 +9,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from lusee_bayes.core.checks import with_error
 from lusee_bayes.flight.gain_model import LETTERS
 from lusee_bayes.flight.reduced import REASONS, USED, Reduced
 from lusee_bayes.instrument.products import all_products
@@ -36,8 +37,10 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     x, y = np.arange(len(hours) + 1) - 0.5, np.arange(len(labels) + 1) - 0.5
     style = {"cmap": drawing.DIVERGING, "norm": Normalize(-WIDEST, WIDEST), "rasterized": True}
     image = left.pcolormesh(x, y, z, **style)
-    ticks = np.linspace(0, len(hours) - 1, 7).astype(int)
-    left.set_xticks(ticks, [f"{hours[k] / 24:.1f}" for k in ticks])
+    days = np.asarray(hours) / 24.0
+    ticks = MaxNLocator(7).tick_values(days[0], days[-1])
+    ticks = ticks[(ticks >= days[0]) & (ticks <= days[-1])]
+    left.set_xticks(np.searchsorted(days, ticks), [f"{day:g}" for day in ticks])
     left.set_yticks(np.arange(len(labels)), labels)
     left.invert_yaxis()
     left.set(xlabel="time [days]", ylabel="product", title="Residuals given all other data")
@@ -104,9 +107,10 @@ def pointing_by_day(result: MapResult) -> Figure | None:
         axes.errorbar(middle, days["value"], days["std"], **style)
         for value, std in whole[["value", "std"]].to_numpy():
             axes.axhspan(value - std, value + std, color=drawing.ORANGE, alpha=0.3)
-            axes.axhline(value, color=drawing.ORANGE, label="all days together")
+            axes.axhline(value, color=drawing.ORANGE)
         kind, _, unit = name.rpartition("_")
         axes.set_ylabel(f"{kind.replace('_', ' ')} [{UNITS.get(unit, unit)}]")
+    panels[0, 0].plot([], [], color=drawing.ORANGE, label="all days together")
     panels[0, 0].legend(loc="upper right", ncols=2, frameon=False)
     panels[-1, 0].set_xlabel("days since the first sample")
     figure.suptitle("Clock and pointing offsets preferred by the data, relative to the model")
@@ -186,9 +190,8 @@ def corner(result: MapResult) -> Figure | None:
             axes.plot(x, np.exp(-0.5 * x**2), color=drawing.BLUE)
             axes.axvline(true[i], color=drawing.ORANGE, lw=1)
             name, unit, value, std = table.iloc[i][["unknown", "unit", "value", "std"]]
-            digits = max(0, 1 - int(np.floor(np.log10(std))))
-            numbers = f"{value:.{digits}f}\n± {std:.{digits}f} {unit}"
-            axes.set_title(f"{name.replace('_', ' ')}\n{numbers}", fontsize=7)
+            numbers = with_error(value, std).replace(" +-", "\n±")
+            axes.set_title(f"{name.replace('_', ' ')}\n{numbers} {unit}", fontsize=7)
         else:
             axes.set(ylim=(-half, half), yticks=ticks if j == 0 else [])
             r = theta.correlation[i, j]

@@ -20,8 +20,8 @@ from lusee_bayes.sampling.validation import Comparison, Ranks
 
 # style of a value for every mode
 DOTS = {"ls": "", "marker": ".", "ms": 3, "color": drawing.BLUE}
-# numbers of quantities in the figures: the first of a run's list
-N_RANKS, N_PAIRS = 8, 5
+# numbers of quantities in the figures: the first of a run's list; and of a chain's ranked draws
+N_RANKS, N_PAIRS, RANKED = 8, 5, 1000
 # fewest draws of a chain that give ranks and densities
 FEWEST = 4
 TOO_FEW = f"not drawn: a chain has fewer than {FEWEST} draws or did not move"
@@ -32,9 +32,11 @@ Quantities = dict[str, Float[np.ndarray, "chains draws"]]
 def ranks(quantities: Quantities) -> Figure:
     """Ranks of each chain's draws among all: differences of their ECDFs from uniform ones.
 
-    The grey band contains 99 % of the curves if chains agree.
+    The grey band contains 99 % of the curves of many chains that agree, of independent draws.
     """
-    chosen = dict(list(quantities.items())[:N_RANKS])
+    # more draws would overflow a cache of ArviZ's, and show no more
+    shown = list(quantities.items())[:N_RANKS]
+    chosen = {name: x[:, :: -(-x.shape[1] // RANKED)] for name, x in shown}
     size = (12, 2.6 * ((len(chosen) + 3) // 4) + 0.4)
     title = "Ranks among the draws of all chains, one curve per chain"
     return _drawn(arviz_plots.plot_rank, chosen, title, size)
