@@ -289,10 +289,9 @@ class Unknowns:
             over = systematic.octaves(attrgetter(systematic.key)(experiment.scenario))
             octaves.append(np.full(len(part.expected), over))
             alike.append(none if systematic.has_table else systematic.like_the_sky())
-        data, columns = experiment.data, np.concatenate([s.columns for s in held], axis=1)
-        # for spectra, the true sky may be known, but true values differ from the scenario's draws
-        has_truth = data.truth is not None and data.calibration is None
-        rows = before_data(held, true_values(experiment.setup) if has_truth else None)
+        columns = np.concatenate([part.columns for part in held], axis=1)
+        # of given data, the true sky may be known, but not whether this scenario simulated them
+        rows = before_data(held, None if (s := experiment.setup).measured else true_values(s))
         return cls(
             tuple(rows.to_dict("records")),
             AmplitudesOfSky.of(inference.solution, columns),

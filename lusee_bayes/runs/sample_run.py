@@ -157,7 +157,8 @@ def sample_together(
             }
             drawn = of_channel(chains, name) if several else chains
             given = drawn, program, inference.model, inference.posterior, one.data
-            more = {"arguments": arguments[name], "truth": true_values(one.setup)}
+            known = None if one.setup.measured else true_values(one.setup)
+            more = {"arguments": arguments[name], "truth": known}
             tree = to_datatree(*given, seed=sampler.seed, attributes=said, **more)
         results.append(SampleResult(one, inference, tree, stages.seconds, speed))
     return tuple(results)

@@ -83,8 +83,8 @@ def test_only_what_the_model_has_is_listed(response_file):
     report = unknowns_report(ground, lb.infer(ground))
     assert report.null.names == ("uniform sky", "regolith")
     assert list(report.table["unknown"]) == ["regolith_k"]
-    # of measured data no truth is known
-    measured = replace(ground, data=replace(ground.data, truth=None))
+    # of given data, even with a known sky, no true values are known
+    measured = lb.build(four_ports(response_file, GROUND), ground.data)
     assert list(unknowns_report(measured, lb.infer(measured)).table) == COLUMNS
 
 
