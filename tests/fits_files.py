@@ -69,9 +69,8 @@ def write_response(path: Path, change=lambda images: None, finer: int = 1) -> Pa
 
 def in_parts(images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Real and imaginary parts of complex images, in single precision."""
-    parts = ("real", np.real), ("imag", np.imag)
     return {
         f"{name}_{part}": of(values).astype(np.float32)
         for name, values in images.items()
-        for part, of in parts
+        for part, of in (("real", np.real), ("imag", np.imag))
     }

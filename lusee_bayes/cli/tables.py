@@ -19,9 +19,9 @@ def forecast_table(forecasts: list[Forecast]) -> Table:
     source = forecasts[0].variation.source
     text = Table(title=escape(source), title_justify="left", title_style="bold")
     text.caption = "expected values; modes: SNR > 1; ell: first with SNR < 1; deg: resolution"
-    text.add_column("variation", no_wrap=True)
+    text.add_column("variation", overflow="fold")
     for name in ("days", "data", "bits", "+bits", "modes", "ell", "deg"):
-        text.add_column(name, justify="right")
+        text.add_column(name, justify="right", no_wrap=True)
     family = ""
     for row, forecast in zip(forecast_rows(forecasts), forecasts, strict=True):
         if row["family"] != family:

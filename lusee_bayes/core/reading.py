@@ -54,7 +54,7 @@ def require_file(path: str | Path, what: str, hint: str = "") -> Path:
     path = user_path(path)
     try:
         mode = path.stat().st_mode
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         hint = f"; {hint}" if hint else ""
         raise InputError(f"no {_kind(what)} at '{path}'{hint}") from error
     except (OSError, ValueError) as error:

@@ -227,7 +227,7 @@ class UnderAnySky:
         power = np.asarray(prior.variance() + prior.colour(prior.white_mean) ** 2)
         autos = auto_indices(setup.beam_source.n_ports)
         modelled = float(np.median(np.asarray(setup.signal)[autos]))
-        brighter = np.nanmedian(np.asarray(data.grid())[autos]) / modelled
+        brighter = np.nanmedian(np.append(np.asarray(data.grid())[autos], modelled)) / modelled
         spectrum = mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
         return cls(setup, data, model, spectrum)
 
@@ -309,10 +309,17 @@ class MixedProducts:
         mistakes.append(DataMistake("the times are reversed", "sort the data by time", turned))
         names = [f"product {product.label}" for product in all_products(n_ports)]
         some = np.asarray(self.judge.data.layout.present).any(1)
-        mistakes += [self._factor(names[k], np.eye(n)[k]) for k in np.flatnonzero(some)]
-        mistakes.append(self._factor("every auto", autos * 1.0))
-        mistakes += [self._gain(k, 1.0 * (first == k) + (second == k)) for k in range(n_ports)]
-        mistakes.append(self._constant(np.flatnonzero(autos)))
+
+        def apart(which: Products) -> bool:
+            """Whether it changes some, but not all, of the data: a factor of all is the sky's."""
+            return bool(0 < np.count_nonzero(which[some]) < some.sum())
+
+        factors = [*zip(names, np.eye(n), strict=True), ("every auto", autos * 1.0)]
+        mistakes += [self._factor(*one) for one in factors if apart(one[1])]
+        gains = [(k, 1.0 * (first == k) + (second == k)) for k in range(n_ports)]
+        mistakes += [self._gain(*one) for one in gains if apart(one[1])]
+        if (autos & some).any():
+            mistakes.append(self._constant(np.flatnonzero(autos & some)))
         yield from ((self.chi2(mistake.w), mistake) for mistake in mistakes)
         yield from self._times()
 

@@ -146,8 +146,8 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
         )
     if abs(data.frequency_mhz - scenario.frequency_mhz) > SAME_FREQUENCY_MHZ:
         raise InputError(
-            f"the data are at {data.frequency_mhz} MHz, the scenario at "
-            f"{scenario.frequency_mhz}; use --set frequency_mhz={data.frequency_mhz}"
+            f"the data are at {data.frequency_mhz:.9g} MHz, not at {scenario.frequency_mhz:.9g}; "
+            f"use --set frequency_mhz={data.frequency_mhz:.9g}, or other data for this channel"
         )
     seen, stated = data.observation, scenario.observation
     east = (seen.lon_deg - stated.lon_deg + 180.0) % 360.0 - 180.0

@@ -390,8 +390,7 @@ class _Step:
             and np.linalg.norm(whole) > np.linalg.norm(self.whole) / 2.0
         )
         swing = max(self.swing / 2.0, SHORTEST) if back else min(2.0 * self.swing, 1.0)
-        size = min(swing, FARTHEST / max(float(np.abs(whole).max()), FARTHEST))
-        return _Step(whole, swing, size)
+        return _Step(whole, swing, min(swing, FARTHEST / max(float(np.abs(whole).max()), FARTHEST)))
 
 
 def _around(

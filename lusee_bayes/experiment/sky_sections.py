@@ -306,8 +306,7 @@ PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)
 
 def _complete_prior(tree: dict[str, Any]) -> None:
     """Choose the model by the entries if there is none: isotropic for those of older scenarios."""
-    isotropic = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
-    if isotropic and not tree.get("model"):
+    if (set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}) and not tree.get("model"):
         tree["model"] = "isotropic"
     if tree.get("model") != "isotropic" and tree.get("spectrum") == "sky":
         del tree["spectrum"]  # another kind replaces the paper's prior

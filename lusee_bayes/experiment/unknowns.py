@@ -438,13 +438,12 @@ class Unknowns:
         single = np.flatnonzero(rows["site"] == rows["unknown"])
         best = np.lexsort((given.std[single], self.octaves[single] == 0))[:MOST_IN_CORNER]
         corner = np.sort(single[best])
-        nside = round(np.sqrt(len(pixels) / 12))
         theta = InstrumentPosterior(
             table,
             rows.loc[corner].filter(UNKNOWN_COLUMNS).reset_index(drop=True),
             {name: float((part[:n] ** 2).sum()) / total for name, part in parts.items()},
             correlation[np.ix_(corner, corner)],
-            (pixel_std(every[:n] @ every[:n].T, nside) / pixels) ** 2,
+            (pixel_std(every[:n] @ every[:n].T, round(np.sqrt(len(pixels) / 12))) / pixels) ** 2,
         )
         return theta, parts, fluxes
 

@@ -165,11 +165,10 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     unseen = sorted(unseen, key=lambda spot: -spot.bias)[:MOST_NAMED]
     named = ", ".join(f"{one.name} by {one.size:g}{one.unit} ({one.bias:.2g})" for one in unseen)
     return (
-        f"Residual chi2 would not reveal an error of {named}, which the model assumes to be exact; "
-        "in brackets, the resulting error of the map in standard deviations (rms over independent "
-        "directions). "
-        "noise.beam.parameters and noise.fields include such errors; more turntable angles reveal "
-        "more of them."
+        f"Residual chi2 would not reveal an error of {named}, which the model takes as exact. In "
+        "brackets: by how many standard deviations it would shift the map (rms over independent "
+        "directions). To allow for such errors, add noise.beam.parameters or noise.fields; more "
+        "turntable angles reveal more of them."
     )
 
 

@@ -341,7 +341,7 @@ def _one_span(
     # stretches that include flagged spectra: also flag those in between
     z = distances(values, sigma, good[None], kept[None], x)[0]
     kept &= ~_flagged_stretches(z, kept | (good & _curve_is_known(values, kept, x)), limit)
-    return good & ~kept, float(np.median(scale))
+    return good & ~kept, float(np.median(scale[scale > 0.0])) if scale.any() else 0.0
 
 
 def _without_the_highest(values: OneRow, sigma: OneRow, good: Span, x: Basis, limit: float) -> Span:

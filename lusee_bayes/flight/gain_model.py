@@ -363,8 +363,7 @@ def synthetic_gains() -> GainModel:
     shape = (f / (f + LOW_MHZ)) ** 2 / (1.0 + (f / HIGH_MHZ) ** 2)
     ports = 1.0 + 0.04 * np.arange(PORTS)
     mean = np.array([MEAN[level] for level in LETTERS])[:, None, None] * ports[:, None] * shape
-    slope = np.log(f / 20.0) / 5.0
-    component = np.stack([mean, mean * slope], axis=2)
+    component = np.stack([mean, mean * (np.log(f / 20.0) / 5.0)], axis=2)
     # the law differs between levels and ports
     factor = 1.0 + 0.1 * np.arange(len(PLACES)).reshape(*LEAD, 1, 1)
     coefficient = np.broadcast_to(TERMS, (*LEAD, N_COMPONENTS, N_TERMS)) * factor

@@ -237,9 +237,11 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
         reason[~whole.any(axis=1)] = reduced.NO_DATA
         reason[saturated] = reduced.SATURATED
         values, n_averaged = np.where(present, values, np.nan).T, frames / variance
-        middle = band.basis[:, 0] / len(band.basis)
-        centre = np.einsum("rpk,k->pr", gain, middle)
-        components = np.einsum("pck,k->pc", basis[:, 1:], middle)
+        # bins beyond the table have no gain
+        known = np.isfinite(basis).any(axis=(0, 1))
+        middle = known / (known.sum() or np.nan)
+        centre = np.einsum("rpk,k->pr", np.where(known, gain, 0.0), middle)
+        components = np.einsum("pck,k->pc", np.where(known, basis[:, 1:], 0.0), middle)
         return {
             "reason": reason,
             "lines": (1.0 - kept.sum(axis=1) / len(band.basis)).astype(np.float32),
@@ -249,7 +251,9 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
             "gain": centre,
             "gain_slope": components[..., None] / centre[:, None],
             "bend": _over(further[:, session.AUTOS].T, _noise(values, n_averaged)),
-            "line_scatter": np.array([flags.robust_scale(z[:, 0], kept)]),
+            "line_scatter": np.array(
+                [flags.robust_scale(z[:, with_auto.any(axis=(0, 2)).argmax()], kept)]
+            ),
         }
 
     return calibrate

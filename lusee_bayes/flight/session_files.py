@@ -128,12 +128,11 @@ class SessionRows(Recorded):
         """Return the fields of every spectrum, by the names of layout 3."""
         first = np.minimum(self.navg_shift, NAVG1_SHIFT)
         gain = np.vectorize(CODES.__getitem__, otypes=[np.int64])(self.level)
-        none = np.zeros(self.n_rows, dtype=np.int64)
         return {
             "Navg1_shift": first,
             "Navg2_shift": self.navg_shift - first,
             "Navgf": self.navgf,
-            **dict.fromkeys(("format", "errors"), none),
+            **dict.fromkeys(("format", "errors"), np.zeros(self.n_rows, dtype=np.int64)),
             **dict.fromkeys(("actual_bitslice", "bitslice"), self.bitslice),
             **dict.fromkeys(("actual_gain", "gain"), gain),
             "adc_min": self.adc_low,

@@ -213,7 +213,7 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
         raise InputError(f"products is '{products}'; give a list of the names of the columns")
     columns: list[tuple[int, int, str]] = []
     for name in products:
-        match = NAME.fullmatch(name if isinstance(name, str) else "".join(map(str, name)))
+        match = NAME.fullmatch(name if isinstance(name, str) else "".join(map(str, np.ravel(name))))
         if not match:
             example = "'01'" if is_complex else "'01R' and '01I'"
             raise InputError(f"unknown product '{name}'; name the two ports, such as {example}")

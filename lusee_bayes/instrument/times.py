@@ -165,13 +165,14 @@ def step_of(times: Time, step_s: float | None) -> float:
     Raises
     ------
     InputError
-        If there is only one time, and no step is given.
+        If there is only one time, or most are equal, and no step is given.
     """
     if step_s is not None:
         return float(step_s)
-    if len(times) < 2:
-        raise InputError("the integration time of a single sample is unknown; give step_s")
-    return float(np.median(np.abs(seconds_from(times[:-1], times[1:]))))
+    steps = np.abs(seconds_from(times[:-1], times[1:]))
+    if len(times) < 2 or not (step := float(np.median(steps))) > 0.0:
+        raise InputError("one time, or equal times, have no step: give step_s, and each time once")
+    return step
 
 
 def counts_up(numbers: Int[np.ndarray, " n"]) -> bool:
@@ -445,8 +446,8 @@ def _bounded(times: Time, bounds: Time, step_s: float | None) -> tuple[Times, Ti
             f"which begin {start[first]:g} s and end {end[first]:g} s from it; sort the bounds "
             "like the times"
         )
-    if step_s is None and step < length.max() <= step + rounding:
-        step = float(length.max())
+    if step_s is None:
+        step = max(step, float(length.max()))
     return start, end, step
 
 

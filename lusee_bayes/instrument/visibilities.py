@@ -276,6 +276,7 @@ class Visibilities(checks.Described):
             raise InputError(
                 f"got {len(utc)} times for data of {values.shape[1]} times (their first axis)"
             )
+        checks.require_shape("frequency_mhz", np.asarray(frequency_mhz), ())
         checks.require_positive("frequency_mhz", frequency_mhz)
         require_mhz("frequency_mhz", frequency_mhz)
         run, angles = runs_of(turntable_deg, len(utc))
@@ -306,9 +307,11 @@ class Visibilities(checks.Described):
         return labels_of(self.layout.n_products)
 
     def digest(self) -> str:
-        """Return a hash of data, layout, times and windows, which identifies the data set."""
-        parts = [self.data, self.layout.product, self.layout.time, self.observation.times.jd]
-        if (windows := self.observation.windows) is not None:
+        """Return a hash of data, layout, times, angles and windows, which identifies them."""
+        seen = self.observation
+        parts = [self.data, self.layout.product, self.layout.time, seen.times.jd]
+        parts.append(np.array(seen.turntable_deg)[seen.run])
+        if (windows := seen.windows) is not None:
             parts += vars(windows).values()
         if self.calibration is not None:
             parts.append(self.calibration.n_averaged)

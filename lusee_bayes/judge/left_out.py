@@ -406,8 +406,7 @@ class LeftOut:
 
     def _halves(self, rows: Float[np.ndarray, "*cells rank"]) -> tuple[np.ndarray, np.ndarray]:
         """x L^-T of rows x, and the sky's columns of x Q^-1."""
-        flat = rows.reshape(-1, rows.shape[-1])
-        half = linalg.solve_lower(self._lower, flat.T, transpose=False)
+        half = linalg.solve_lower(self._lower, rows.reshape(-1, rows.shape[-1]).T, transpose=False)
         sky = linalg.solve_lower(self._lower, half, transpose=True)[self._n_templates :].T
         return half.T.reshape(rows.shape), sky.reshape(*rows.shape[:-1], -1)
 

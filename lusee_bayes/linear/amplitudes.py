@@ -269,11 +269,10 @@ class Shared:
         weight, pulled = self.root.T @ inverse, self.pull.T @ inverse
         across, among = weight @ self.pull, (weight - self.root.T) @ self.root
         matrix = np.block([[local.matrix + pulled @ self.pull, across.T], [across, among]])
-        vector = np.concatenate([local.vector, self.root.T @ self.mean])
         return replace(
             local,
             matrix=matrix,
-            vector=vector,
+            vector=np.concatenate([local.vector, self.root.T @ self.mean]),
             reference=np.concatenate([sky, at]),
             misfit=np.asarray(local.misfit - self.mean @ self.mean),
             log_det=np.asarray(local.log_det + np.linalg.slogdet(self.covariance)[1]),

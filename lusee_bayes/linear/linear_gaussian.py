@@ -453,8 +453,7 @@ class FromInformation(Form):
         largest = (np.asarray(solution.posterior.lower) ** 2).sum(1).max()
         for sign, one in ((1.0, old), (-1.0, factor)):
             if isinstance(one, LowRankFactor):
-                weighted = np.asarray(base.whiten_transpose(one.v))
-                pull = host.coupling.transpose_mv(weighted)
+                pull = host.coupling.transpose_mv(np.asarray(base.whiten_transpose(one.v)))
                 half = solve_lower(np.asarray(one.lower), pull.T, transpose=False)
                 matrix = matrix + sign * gram_matrix(half)
                 largest = max(largest, (host.prior.colour_columns(half) ** 2).sum(0).max())

@@ -252,8 +252,7 @@ def summed(coupling: CouplingMatrix, weights: Float[np.ndarray, "..."]) -> Modes
         weights = weights[used] if weights.ndim == 2 else weights[used][:, used]
     # runs of one turntable angle see the sky with the same beams
     angles = np.asarray(pointing.turntable)
-    weighs = [bool(weights[..., span].any()) for span in runs.values()]
-    for angle in np.unique(angles[weighs]):
+    for angle in np.unique(angles[[bool(weights[..., span].any()) for span in runs.values()]]):
         group = np.flatnonzero(angles == angle)
         times = np.concatenate([np.arange(pointing.n_times)[runs[run]] for run in group])
         sums = weights[..., times], pointing.azimuth[times], pointing.functions[times].T

@@ -284,8 +284,7 @@ def _noise_x100(cases: Cases) -> Verdict:
 def _resolution(cases: Cases) -> Verdict:
     first = [cross(case) for case in bands(cases)]
     inside = sum(18 <= ell <= 37 for ell in first)
-    degrees = [180 / ell for ell in first]
-    text = f"SNR < 1 from ell {span(first)}, {span(degrees, '.1f')} degrees; "
+    text = f"SNR < 1 from ell {span(first)}, {span([180 / ell for ell in first], '.1f')} degrees; "
     text += f"{inside} of {len(first)} bands in the range"
     return grade(text, inside == len(first), 2 * inside >= len(first))
 

@@ -130,8 +130,7 @@ def windows(lmax: int) -> Float[np.ndarray, "bands ells"]:
     n = max(1, int(np.floor(np.log2(lmax / 1.5))) + 1)
     edges = lmax / 2.0 ** np.arange(n - 1, 0, -1)
     # the fraction of each ell that is below an edge, which falls over an octave
-    octaves = np.clip(np.log2(ell[None] / edges[:, None]), 0.0, 1.0)
-    below = np.cos(0.5 * np.pi * octaves) ** 2
+    below = np.cos(0.5 * np.pi * np.clip(np.log2(ell[None] / edges[:, None]), 0.0, 1.0)) ** 2
     shares = np.diff(np.concatenate([np.zeros((1, lmax)), below, np.ones((1, lmax))]), axis=0)
     bands = np.zeros((n, lmax + 1))
     bands[:, 1:] = np.sqrt(np.where(shares > 1e-12, shares, 0.0))

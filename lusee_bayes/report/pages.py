@@ -47,7 +47,6 @@ def map_page(folder: Path, name: str) -> str:
     run = FinishedRun.read(folder)
     summary = read_model(folder / "summary.json", MapSummary, "the figures of a map run")
     channels = run.channels
-    tests = N_TESTS * len(channels)
     return render_run(
         "map.html",
         folder / "summary.json",
@@ -56,7 +55,7 @@ def map_page(folder: Path, name: str) -> str:
         channels=channels,
         judged=[_groups(c.judged) for c in channels],
         unfit=[test.level != "consistent" for test in summary.tests],
-        bad=[stands_out(channel.instrument.p, tests) for channel in channels],
+        bad=[stands_out(channel.instrument.p, N_TESTS * len(channels)) for channel in channels],
         regions=_regions(run),
         viewer=viewer(name, channels),
         smoothing_deg=taper_fwhm_deg(max(lmax_of(len(channels[0].mean)), 1)),

@@ -257,7 +257,7 @@ KEPT = "a posterior of lusee-bayes map --information"
 def information_file(folder: str | Path) -> Path:
     """The file with a run's saved information. InputError if the folder has none."""
     recover(folder)
-    return require_file(user_path(folder).resolve() / "posterior.nc", KEPT)
+    return require_file(user_path(folder).resolve() / "posterior.nc", KEPT, "give a map's folder")
 
 
 def read_information(path: Path, channel: Scenario) -> SavedInformation:

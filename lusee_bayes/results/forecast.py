@@ -104,7 +104,6 @@ def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
     rows, first = [], {row.variation.source: row for row in reversed(forecasts)}
     for row in forecasts:
         it, resolution = row.variation, row.resolution_deg
-        more = row.information_bits - first[it.source].information_bits
         columns = {
             "scenario": it.source,
             "family": it.family,
@@ -112,7 +111,7 @@ def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
             "days": f"{row.days:.2f}",
             "n_data": row.n_data,
             "information_bits": f"{row.information_bits:.2f}",
-            "difference_bits": f"{more:.2f}",
+            "difference_bits": f"{row.information_bits - first[it.source].information_bits:.2f}",
             "modes_snr_above_1": row.modes,
             "ell_cross": "none" if row.ell_cross is None else row.ell_cross,
             "resolution_deg": "none" if resolution is None else f"{resolution:.2f}",

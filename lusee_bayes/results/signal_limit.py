@@ -76,7 +76,7 @@ class SignalLimit:
     def sentence(self) -> str:
         """The limit in words, with the source that sets it."""
         amplitude = f"{self.amplitude:.3g} +- {self.std:.2g} K"
-        if not self.fit.fits:
+        if not (self.fit.fits or self.fit.too_small):
             return (
                 f"{self.name}: no limit, a smooth spectrum of the {self.region} does not fit "
                 f"({self.fit.words()}); raise --order"
@@ -204,4 +204,5 @@ def named_template(text: str) -> tuple[str, Callable[[Frequencies], Vector]]:
         )
     table = read_table(Path(text), TABLE)
     mhz, kelvin = table["frequency_mhz"], table["temperature_k"]
-    return Path(text).stem, lambda f: np.interp(f, mhz, kelvin)
+    shape = kelvin / (np.abs(kelvin).max() or 1.0)
+    return f"{Path(text).stem}, at its peak", lambda f: np.interp(f, mhz, shape, np.nan, np.nan)

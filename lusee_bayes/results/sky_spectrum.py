@@ -387,8 +387,7 @@ class IndexMaps:
         x = np.log(frequencies_mhz / reference)
         positive = (draws > 0.0).all(0)
         log = np.log(np.where(positive, draws, 1.0))
-        relative = draws.std(1) / draws.mean(1)
-        cells = zip(np.moveaxis(log, 2, 0), 1.0 / relative.T, strict=True)
+        cells = zip(np.moveaxis(log, 2, 0), 1.0 / (draws.std(1) / draws.mean(1)).T, strict=True)
         fits = [np.polyfit(x, of_cell, 2, w=weight) for of_cell, weight in cells]
         c, b, _ = np.stack(fits, axis=1)  # (cells, draws) each
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):

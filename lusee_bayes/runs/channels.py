@@ -644,9 +644,8 @@ def map_channels(
         tied, tests = tie_channels(scenario, frequencies, [one.share for one in seen])
     if scenario.joint:
         at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
-        n_draws = max(scenario.output.draws, N_DRAWS)
         components, posterior = solve_components(
-            _without(unmapped, scenario), at_hand, seen, n_draws
+            _without(unmapped, scenario), at_hand, seen, max(scenario.output.draws, N_DRAWS)
         )
 
     def finish(channel: Scenario) -> None:

@@ -70,8 +70,9 @@ def origin_of(
 
 
 def identity_of(scenario: Scenario, *inputs: object) -> str:
-    """Digest of everything that determines results: scenario, other inputs, and version."""
-    return text_hash(json.dumps([scenario.to_yaml(), *map(str, inputs), __version__]))
+    """Digest of everything that determines results: scenario, its files, inputs, and version."""
+    changed = [os.stat(path).st_mtime_ns for path in inputs_of(scenario)]
+    return text_hash(json.dumps([scenario.to_yaml(), changed, *map(str, inputs), __version__]))
 
 
 def inputs_of(

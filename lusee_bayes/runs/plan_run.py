@@ -262,7 +262,8 @@ def length(runs: Sequence[RunSection]) -> str:
 
 def kept_forecast(folder: Path, variation: Variation) -> Forecast:
     """Read the forecast of a variation from its JSON file in a folder, or make and write it."""
-    path = folder / f"{identity_of(variation.scenario, variation.lost)}.json"
+    v = variation
+    path = folder / f"{identity_of(v.scenario, v.lost, turned(v.family))}.json"
     if path.is_file():
         kept = json.loads(path.read_text(encoding="utf-8"))
         return Forecast(variation, **kept | {"snr_squared": np.array(kept["snr_squared"])})
@@ -300,7 +301,7 @@ def forecasts_of(
     """
     # workers may have another working directory
     anchored = [replace(v, scenario=v.scenario.anchored()) for v in variations]
-    digests = [identity_of(v.scenario, v.lost) for v in anchored]
+    digests = [identity_of(v.scenario, v.lost, turned(v.family)) for v in anchored]
     different: dict[str, Variation] = {}
     for digest, variation in zip(digests, anchored, strict=True):
         different.setdefault(digest, variation)
@@ -356,6 +357,8 @@ def run_plan(
     for name, scenario in scenarios.items():
         with naming(name):
             scenario.require_single("a forecast has")
+            if scenario.observation.average_s is not None:
+                raise InputError("a plan does not average: set observation.step_s, window=mean")
             require_fits(posterior_cost(scenario), scenario)
     digests = {name: text_hash(s.to_yaml())[:12] for name, s in scenarios.items()}
     inputs = [path for scenario in scenarios.values() for path in inputs_of(scenario)]

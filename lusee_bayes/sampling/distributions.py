@@ -189,8 +189,7 @@ class TimesStudentT(Prediction):
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute ln p(d | loc, N, nu) of one data vector, or of every row of an array."""
         n = self._data_of_times()
-        half = (self.nu + n) / 2.0
-        constant = (gammaln(half) - n * jnp.log(self.nu) / 2.0).sum()
+        constant = (gammaln((self.nu + n) / 2.0) - n * jnp.log(self.nu) / 2.0).sum()
         constant = constant - self.layout.n_times * gammaln(self.nu / 2.0)
         constant = constant - self.layout.size * 0.5 * np.log(np.pi) - 0.5 * self.factor.log_det()
         return constant - self.misfit(value)

@@ -611,8 +611,7 @@ class _Run:
         self, program: Callable, arguments: dict, sampler: Sampler, whitening: Whitening | None
     ):
         def model(whitening, arguments):
-            run = program if whitening is None else whitened(program, whitening)
-            return run(**arguments)
+            return (program if whitening is None else whitened(program, whitening))(**arguments)
 
         latent = programs.latent_sites(program, arguments)
         white = set() if whitening is None else set(whitening.names)

@@ -458,10 +458,8 @@ def pixel_statistics(skies: Skies, nside: int) -> dict[str, Float[np.ndarray, " 
     matrix = pixel_matrix(nside, lmax_of(flat.shape[-1]))
     for first in range(0, len(matrix), CHUNK):
         values = flat @ matrix[first : first + CHUNK].T
-        ends = np.quantile(values, tails, axis=0)
-        parts.append([values.mean(0), values.std(0, ddof=1), *ends])
-    columns = np.concatenate(parts, axis=1)
-    return dict(zip(("mean", "std", "lower", "upper"), columns, strict=True))
+        parts.append([values.mean(0), values.std(0, ddof=1), *np.quantile(values, tails, axis=0)])
+    return dict(zip(("mean", "std", "lower", "upper"), np.concatenate(parts, axis=1), strict=True))
 
 
 def sky_quantities(

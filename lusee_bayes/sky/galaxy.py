@@ -468,8 +468,7 @@ class Slabs:
             radius = np.sqrt(SUN_RADIUS_KPC**2 + along * (along - 2.0 * SUN_RADIUS_KPC * cos_lon))
             n_squared = thick_disc(radius) * height_profile(z, THICK_HEIGHT_KPC)
             n_squared = n_squared + thin_disc(radius) * height_profile(z, THIN_HEIGHT_KPC)
-            disc = emissivity(radius, z) * ds
-            emitted[k], smooth = disc[of_line], n_squared[of_line]
+            emitted[k], smooth = (emissivity(radius, z) * ds)[of_line], n_squared[of_line]
 
             # Each region counts by the exact share of the slab inside it, to avoid ragged outlines.
             begin, length = (near * stretch)[of_line], ds[of_line]

@@ -357,8 +357,7 @@ class HarmonicPrior(DiagonalPrior):
     def widths(self) -> Float[Array, " modes"]:
         # at an ell without power the derivative of sqrt is zero here, not infinite
         xp, power = namespace(self.spectrum), self.spectrum > 0
-        root = xp.sqrt(xp.where(power, self.spectrum, 1.0))
-        return per_mode(xp.where(power, root, 0.0))
+        return per_mode(xp.where(power, xp.sqrt(xp.where(power, self.spectrum, 1.0)), 0.0))
 
     def widened(self, factor):
         return HarmonicPrior(self.spectrum * factor**2, mean=self.mean)

@@ -133,8 +133,7 @@ class PointingOffsets(Systematic):
     def build(cls, section: PointingSection, setup: Setup, around: Around) -> PointingOffsets:
         names = offset_names(section.kinds, setup.observation.n_runs)
         stds = {name: float(getattr(section, offset_kind(name))) for name in names}
-        values = around.values or {}
-        return cls.of(setup, stds, {name: values.get(name, 0.0) for name in names})
+        return cls.of(setup, stds, {name: (around.values or {}).get(name, 0.0) for name in names})
 
     @classmethod
     def of(

@@ -128,8 +128,7 @@ ANSWERS = [b"", b"HTTP/1.0 400 Bad Request\r\n\r\n"]
 @pytest.mark.parametrize("answer", ANSWERS, ids=["silent", "HTTP"])
 def test_what_is_no_scheduler_is_refused_in_seconds(answer, monkeypatch):
     """A Client would wait for ever, deaf to Ctrl-C, or ask for exabytes of memory."""
-    dask_engine = pytest.importorskip("lusee_bayes.core.dask_engine")
-    monkeypatch.setattr(dask_engine, "ANSWER_S", 0.5)
+    monkeypatch.setattr(pytest.importorskip("lusee_bayes.core.dask_engine"), "ANSWER_S", 0.5)
 
     class Answer(socketserver.BaseRequestHandler):
         def handle(self):

@@ -140,8 +140,7 @@ def test_a_death_at_any_step_leaves_the_old_or_the_new(tmp_path):
     program = [sys.executable, "-c", EVENTS, given]
     done = subprocess.run(program, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    scenes = json.loads(done.stdout)
-    for (start, found, again), earlier in zip(scenes, ({}, OLD), strict=True):
+    for (start, found, again), earlier in zip(json.loads(done.stdout), ({}, OLD), strict=True):
         old = with_folders(OWN | WORK | earlier)
         assert {name: text for name, text in start.items() if name != fs.MANIFEST} == old
         files = NEW | ({"kept.fits": OLD["kept.fits"]} if earlier else {})

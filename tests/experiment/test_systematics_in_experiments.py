@@ -46,8 +46,7 @@ def test_the_posteriors_own_prediction_has_settled():
     scale = float(jnp.abs(predicted).max())
     within(prediction(setup, found, np.zeros(found.model.n_data)), predicted, 1e-12 * scale)
     gains = {"gains": found.around.gains, "gain_slope": found.around.gain_slope}
-    around = Around(data, predicted, **gains)
-    again = full_model(setup, around).condition(data.data).posterior
+    again = full_model(setup, Around(data, predicted, **gains)).condition(data.data).posterior
     assert float(again.rms_shift_from(posterior.mean)) < SETTLED
     # it did move on the way
     measured = inferred(GAIN, "noise.gain.visibilities=measured").posterior

@@ -162,12 +162,11 @@ KINDS = ["hdf5", "fits"]
 
 def some_rows(**changes):
     rng = np.random.default_rng(5)
-    level = np.array([list("MMMM")] * 3 + [list("LMHL")] * 4)
     rows = SessionRows(
         raw_s=2.3e7 + 0.7 + 42.0 * np.arange(ROWS),
         navgf=np.full(ROWS, 2),
         navg_shift=np.full(ROWS, 20),
-        level=level,
+        level=np.array([list("MMMM")] * 3 + [list("LMHL")] * 4),
         bitslice=rng.integers(0, 31, (ROWS, 16)),
         adc_low=-rng.integers(100, 8000, (ROWS, 4)),
         adc_high=rng.integers(100, 8000, (ROWS, 4)),

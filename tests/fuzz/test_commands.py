@@ -199,8 +199,7 @@ def test_every_entry_with_any_value(n):
     @given(st.lists(st.tuples(st.sampled_from(PATHS), VALUES), min_size=1, max_size=3))
     def check(entries):
         # YAML takes JSON, and what JSON does not have (NaN, Infinity) as text
-        overrides = [f"{path}={json.dumps(value)}" for path, value in entries]
-        require_answer(lambda: load(overrides))
+        require_answer(lambda: load([f"{path}={json.dumps(value)}" for path, value in entries]))
 
     check()
 
@@ -248,7 +247,6 @@ def test_any_frequencies(n):
     @settings(max_examples=n)
     @given(st.tuples(st.lists(parts, min_size=1, max_size=4), st.sampled_from(",:")))
     def check(drawn):
-        text = drawn[1].join(drawn[0])
-        require_answer(lambda: parse_frequencies(text))
+        require_answer(lambda: parse_frequencies(drawn[1].join(drawn[0])))
 
     check()

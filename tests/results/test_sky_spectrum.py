@@ -150,9 +150,10 @@ def test_templates_and_what_has_no_limit(tmp_path):
     bent = spectrum_of(f, 1e5 * (1.0 + 0.5 * np.sin(f)), np.eye(len(f)))
     assert "raise --order" in signal_limit(bent, *named_template("constant")).sentence()
     file = tmp_path / "dip.csv"
-    file.write_text("frequency_mhz,temperature_k\n10,0\n20,-1\n30,0\n")
+    file.write_text("frequency_mhz,temperature_k\n10,0\n20,-0.02\n30,0\n")
     name, template = named_template(str(file))
-    assert name == "dip" and template(np.array([15.0]))[0] == -0.5
+    assert name == "dip, at its peak"
+    np.testing.assert_array_equal(template(np.array([15.0, 31.0])), [-0.5, np.nan])
     assert named_template("excess")[1](np.array([20.0]))[0] == 1.0
     for text in ("trough:1", "trough:17:0", "nothing"):
         refuse("expected trough|no template", named_template, text)

@@ -250,8 +250,7 @@ class Monopoles(BeamSource, eqx.Module):
         direct = self._current_integral(k, along * sin + up * cos)
         bounced = self._current_integral(k, along * sin - up * cos) * ground
         to_direct = (along * cos - up * sin).astype(direct.dtype)
-        to_bounced = (along * cos + up * sin).astype(direct.dtype)
-        e_theta = to_direct * direct - p * to_bounced * bounced
+        e_theta = to_direct * direct - p * (along * cos + up * sin).astype(direct.dtype) * bounced
         return e_theta, across.astype(direct.dtype) * (direct + s * bounced)
 
     def _current_integral(self, k: Scalar, projection: Array) -> Fields:
@@ -388,8 +387,7 @@ def _patterns(
     visible = directions[:, 2] > 0.0
     # a visible direction replaces the hidden ones, for finite fields and derivatives
     xp = namespace(frequency_mhz, directions, monopoles)
-    stand_in = np.array([0.6, 0.0, 0.8])[None]
-    east, north, up = xp.where(visible[:, None], directions, stand_in).T
+    east, north, up = xp.where(visible[:, None], directions, np.array([0.6, 0.0, 0.8])[None]).T
     theta, phi = xp.arctan2(xp.hypot(east, north), up), xp.arctan2(north, east)
     patterns = to_real(stokes_pairs(*monopoles.towards(frequency_mhz, theta, phi), stokes))
     # the autos' integral is converged on the coarsest grid

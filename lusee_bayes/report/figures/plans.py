@@ -49,8 +49,7 @@ def forecasts(planned: Sequence[Forecast]) -> Figure:
         axis.margins(x=0.14)
         axis.tick_params(axis="y", length=0)
         axis.spines[["top", "right", "left"]].set_visible(False)
-    labels = [name or family for family, name in rows]
-    axes[0].set_yticks(list(rows.values()), labels, fontsize=9)
+    axes[0].set_yticks(list(rows.values()), [name or family for family, name in rows], fontsize=9)
     axes[0].set_ylim(max(rows.values()) + 0.7, -0.7)  # from the top down
     for (_, name), tick in zip(rows, axes[0].get_yticklabels(), strict=True):
         if not name:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import arviz_base
 import arviz_plots
 import numpy as np
+from arviz_stats.base import array_stats
 from jaxtyping import Float
 from matplotlib import pyplot
 from matplotlib.colors import Normalize
@@ -22,6 +23,8 @@ from lusee_bayes.sampling.validation import Comparison, Ranks
 DOTS = {"ls": "", "marker": ".", "ms": 3, "color": drawing.BLUE}
 # numbers of quantities in the figures: the first of a run's list; and of a chain's ranked draws
 N_RANKS, N_PAIRS, RANKED = 8, 5, 1000
+# sqrt(n) times the largest distance of two cumulative distributions: 99 % are smaller
+KOLMOGOROV = 1.63
 # fewest draws of a chain that give ranks and densities
 FEWEST = 4
 TOO_FEW = f"not drawn: a chain has fewer than {FEWEST} draws or did not move"
@@ -32,14 +35,23 @@ Quantities = dict[str, Float[np.ndarray, "chains draws"]]
 def ranks(quantities: Quantities) -> Figure:
     """Ranks of each chain's draws among all: differences of their ECDFs from uniform ones.
 
-    The grey band contains 99 % of the curves of many chains that agree, of independent draws.
+    The grey band contains 99 % of the curves if chains agree (Kolmogorov's limit for the effective
+    number of draws of each chain).
     """
     # more draws would overflow a cache of ArviZ's, and show no more
     shown = list(quantities.items())[:N_RANKS]
     chosen = {name: x[:, :: -(-x.shape[1] // RANKED)] for name, x in shown}
     size = (12, 2.6 * ((len(chosen) + 3) // 4) + 0.4)
     title = "Ranks among the draws of all chains, one curve per chain"
-    return _drawn(arviz_plots.plot_rank, chosen, title, size)
+    # ArviZ's band spans everything for some numbers of draws
+    figure = _drawn(
+        arviz_plots.plot_rank, chosen, title, size, visuals={"credible_interval": False}
+    )
+    for axes, x in zip(figure.axes, chosen.values(), strict=False):
+        effective = sum(array_stats.ess(one[None], chain_axis=0, draw_axis=1) for one in x)
+        half = KOLMOGOROV * np.sqrt((len(x) - 1) / effective)
+        axes.axhspan(-half, half, color=drawing.GREY, alpha=0.2, lw=0)
+    return figure
 
 
 def pairs(quantities: Quantities) -> Figure:
