@@ -227,8 +227,8 @@ def _finished(path: Path, identity: dict, sampler: Sampler) -> xr.DataTree | Non
         same = json.loads(tree.attrs["identity"]) == json.loads(json.dumps(identity))
     if not same or tree["posterior"].sizes["draw"] != sampler.draws:
         raise InputError(
-            f"'{path.parent}' contains a finished run with other settings; omit --resume to "
-            "replace it, or give another folder"
+            f"'{path.parent}' contains a finished run with other settings or number of draws; "
+            "give another folder, or omit --resume to replace its draws"
         )
     return tree
 

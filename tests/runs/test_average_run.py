@@ -91,7 +91,7 @@ BAD_INPUT = [
     (["--to", "10min"], "shorter than the samples (1800 s)"),
     (["--to", "2h", "-o", "w.fits"], "give -o a name that does not end in .fits"),
     (["--to", "2h", "-o", "data.nc"], "data.nc' is an input of this run"),
-    (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25.0 MHz"),
+    (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25 MHz"),
     (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages have one frequency"),
     (["--to", "2h", "--set", "observation.timestamp=start"], "remove that"),
 ]
