@@ -335,6 +335,7 @@ def test_a_wrong_resonance_in_one_channel_of_eight_is_named(tmp_path, monkeypatc
     # what is drawn is shared
     later = corner(replace(found, channels=found.channels[3:]))
     assert later.get_suptitle() == "Unknowns of the instrument (channel of 21 MHz)"
-    for one in found.channels:
+    # the data at 19 MHz are given, not simulated
+    for one in (*found.channels[:3], *found.channels[4:]):
         (own,) = one.unknowns.table[["value", "true", "std"]].to_numpy()
-        assert abs(own[0] - own[1]) < 4.0 * own[2] or one.frequency_mhz == 19.0
+        assert abs(own[0] - own[1]) < 4.0 * own[2]
