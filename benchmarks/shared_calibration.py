@@ -18,7 +18,7 @@ import numpy as np
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
-from lusee_bayes.experiment.model import set_up, simulate
+from lusee_bayes.experiment.model import set_up, simulate, true_values
 from lusee_bayes.experiment.scenario import Scenario
 
 NOISE = {
@@ -65,21 +65,22 @@ def main() -> None:
         file, units = folder / "mean.fits", {"coord": "G", "column_units": "K"}
         healpy.write_map(file, modes_to_map(np.asarray(sky), 16), dtype=np.float64, **units)
         for seed in range(given.first, given.n, given.step):
-            cube, data = scenario(seed, file), []
+            cube, data, true = scenario(seed, file), [], []
             for number, channel in enumerate(cube.channels()):
                 setup = set_up(channel)
                 white = np.random.default_rng(1000 * seed + number)
                 drawn = setup.prior.colour(white.standard_normal(setup.prior.size))
                 modes = np.asarray(drawn) + np.asarray(setup.prior.mean)
+                true.append(true_values(setup))
                 data.append(simulate(setup.under(replace(setup.sky, modes=modes))))
             found = lb.run_map(cube, folder / "map", data=data, replace=True).result
             of_sky.append([])
             of_instrument.append([])
-            for one, seen in zip(found.channels, data, strict=True):
+            for one, seen, known in zip(found.channels, data, true, strict=True):
                 off = one.mean - np.asarray(seen.truth)
                 of_sky[-1].append(off @ np.linalg.solve(one.covariance, off) / len(off))
                 rows = one.theta.corner
-                pulls = ((rows["value"] - rows["true"]) / rows["std"]).to_numpy()
+                pulls = ((rows["value"] - rows["unknown"].map(known)) / rows["std"]).to_numpy()
                 away = np.linalg.solve(one.theta.correlation, pulls)
                 of_instrument[-1].append(pulls @ away / len(pulls))
             print(seed, np.round(of_sky[-1], 2), np.round(of_instrument[-1], 2), flush=True)
