@@ -238,7 +238,7 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
         reason[saturated] = reduced.SATURATED
         values, n_averaged = np.where(present, values, np.nan).T, frames / variance
         # bins beyond the table have no gain
-        known = np.isfinite(basis).any(axis=(0, 1))
+        known, port = np.isfinite(basis).any(axis=(0, 1)), with_auto.any(axis=(0, 2)).argmax()
         middle = known / (known.sum() or np.nan)
         centre = np.einsum("rpk,k->pr", np.where(known, gain, 0.0), middle)
         components = np.einsum("pck,k->pc", np.where(known, basis[:, 1:], 0.0), middle)
@@ -251,9 +251,7 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
             "gain": centre,
             "gain_slope": components[..., None] / centre[:, None],
             "bend": _over(further[:, session.AUTOS].T, _noise(values, n_averaged)),
-            "line_scatter": np.array(
-                [flags.robust_scale(z[:, with_auto.any(axis=(0, 2)).argmax()], kept)]
-            ),
+            "line_scatter": np.array([flags.robust_scale(z[:, port], kept)]),
         }
 
     return calibrate

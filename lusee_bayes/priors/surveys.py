@@ -94,7 +94,7 @@ class Survey:
         whole = scaled(covariance + errors, self.beam, overwrite=True) + gram_matrix(self.shapes)
         if self.unseen is not None:
             whole += self._blind()
-        # white errors of a wide beam's map would be its whole content on small scales
+        # on scales that the beam removes, white errors would be all there is
         n = int((self.beam > LEAST_BEAM).sum())
         root = checked_cholesky("the covariance of a survey", whole[:n, :n])
         half = solve_lower(root, np.stack([off, *self.shapes]).T[:n], transpose=False)

@@ -262,8 +262,10 @@ def measured_experiment(
     Raises
     ------
     InputError
-        As :func:`.read_data` and :func:`require_fits`.
+        As :func:`.read_data` and :func:`require_fits`; if simulated data are to be averaged.
     """
+    if data is None and scenario.observation.average_s is not None:
+        raise InputError("observation.average_s is for given data: simulate a file, then map it")
     measured = None if data is None else read_data(data, scenario)
     require_resources(scenario, measured, stages, n_draws)
     experiment = make(scenario, measured, stages)

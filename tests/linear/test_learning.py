@@ -90,8 +90,7 @@ def test_learning_gains_over_the_start_under_local_scales():
     mean, about = family.hyperprior.moments(found.scores.mean, found.scores.covariance)
 
     def evidence(shift):
-        level = mean + shift * (np.arange(len(mean)) == 0)
-        prior = family.prior(family.averaged(level, about))
+        prior = family.prior(family.averaged(mean + shift * (np.arange(len(mean)) == 0), about))
         return float(information.posterior(prior).log_evidence)
 
     best = float(information.posterior(found.prior).log_evidence)
@@ -245,8 +244,7 @@ def test_what_no_sky_explains_raises_n(case):
     bad = replace(case.information, misfit=np.asarray(50.0 * case.information.misfit))
     factor = learning.demanded_factor(bad, case.family.expected())
     assert 30.0 < factor < 80.0
-    found = learning.learn_whatever_fits(case.family, bad)
-    assert found.noise_factor >= factor > 1.0
+    assert learning.learn_whatever_fits(case.family, bad).noise_factor >= factor > 1.0
 
 
 def test_where_nothing_settles_the_prior_is_fixed_and_wide(case, monkeypatch):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from assertions import refuse
 from commands import refused, run
 from experiments import flagged
 
@@ -82,6 +83,7 @@ def test_what_flags_cost_is_said(data, tmp_path):
 
 def test_average_s_of_the_scenario_does_not_count(path, data, tmp_path):
     given = scenario("observation.average_s=3600")
+    refuse("simulate a file", lb.run_map, given, tmp_path / "map")
     made = lb.run_average(given, path, 7200.0, tmp_path / "a.nc", information=False)
     assert made.data.observation.n_times == data.observation.n_times
 

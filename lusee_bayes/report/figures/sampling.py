@@ -44,9 +44,8 @@ def ranks(quantities: Quantities) -> Figure:
     size = (12, 2.6 * ((len(chosen) + 3) // 4) + 0.4)
     title = "Ranks among the draws of all chains, one curve per chain"
     # ArviZ's band spans everything for some numbers of draws
-    figure = _drawn(
-        arviz_plots.plot_rank, chosen, title, size, visuals={"credible_interval": False}
-    )
+    bare = {"credible_interval": False}
+    figure = _drawn(arviz_plots.plot_rank, chosen, title, size, visuals=bare)
     for axes, x in zip(figure.axes, chosen.values(), strict=False):
         effective = sum(array_stats.ess(one[None], chain_axis=0, draw_axis=1) for one in x)
         half = KOLMOGOROV * np.sqrt((len(x) - 1) / effective)
