@@ -619,8 +619,7 @@ def keys_command(key: str = "", *, markdown: Flag = False, schema: Flag = False)
         print(json.dumps(Scenario.model_json_schema(), indent=1))
         return
     keys = scenario_keys(key)
-    lines = [keys_as_markdown(keys).rstrip()] if markdown else map(str, keys)
-    say(*lines)
+    say(*([keys_as_markdown(keys).rstrip()] if markdown else map(str, keys)))
 
 
 @app.command(name="scenarios", group="Scenarios")

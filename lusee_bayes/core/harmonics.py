@@ -358,8 +358,7 @@ def _rotation(matrix: bytes, lmax: int) -> Rotation:
     for ell in range(lmax + 1):
         # the eigenvalues of i axis . K are integers
         values, vectors = np.linalg.eigh(1j * np.tensordot(axis, generators(ell), 1))
-        waves = vectors * np.exp(-1j * angle * np.rint(values))
-        blocks.append(np.real(waves @ vectors.conj().T))
+        blocks.append(np.real((vectors * np.exp(-1j * angle * np.rint(values))) @ vectors.conj().T))
     return Rotation(tuple(blocks))
 
 

@@ -55,7 +55,9 @@ class Stages:
         self._finish(name, start)
 
     @contextmanager
-    def progress(self, name: str, total: int) -> Iterator[Callable[[int, str], None]]:
+    def progress(
+        self, name: str, total: int, rounds: bool = False
+    ) -> Iterator[Callable[[int, str], None]]:
         """Run a ``with`` block as a stage with a progress bar, or with lines outside a terminal.
 
         Parameters
@@ -63,6 +65,8 @@ class Stages:
         name : str
         total : int
             Number of steps.
+        rounds : bool
+            The steps are rounds until something settles, ``total`` at most: no share is known.
 
         Yields
         ------
@@ -73,14 +77,14 @@ class Stages:
         if self.console is None:
             yield lambda done, remark="": None
         elif not self.console.is_terminal:
-            yield self._lines(name, total)
+            yield self._lines(name, total, rounds)
         else:
+            of_rounds = bars.TextColumn("round {task.completed}, at most {task.total}")
+            share = (bars.BarColumn(), bars.MofNCompleteColumn(), bars.TimeRemainingColumn())
             columns = (
                 bars.TextColumn("{task.description}", markup=False),
-                bars.BarColumn(),
-                bars.MofNCompleteColumn(),
+                *([of_rounds] if rounds else share),
                 bars.TimeElapsedColumn(),
-                bars.TimeRemainingColumn(),
                 bars.TextColumn("{task.fields[remark]}", markup=False),
             )
             with bars.Progress(*columns, console=self.console, transient=True) as bar:
@@ -88,7 +92,7 @@ class Stages:
                 yield lambda done, remark="": bar.update(task, completed=done, remark=remark)
         self._finish(name, start)
 
-    def _lines(self, name: str, total: int) -> Callable[[int, str], None]:
+    def _lines(self, name: str, total: int, rounds: bool) -> Callable[[int, str], None]:
         """Progress in a file: a line once 10 s and 5 % of the stage have passed since the last."""
         said, last = time.perf_counter(), 0
         counting = threading.Lock()
@@ -100,7 +104,8 @@ class Stages:
                 if now - said < LINE_S or abs(done - last) < LINE_SHARE * total or done >= total:
                     return
                 said, last = now, done
-            self.say(f"  {name}: {done} of {total} ({done / total:.0%}) {remark}".rstrip())
+            share = f", at most {total};" if rounds else f" of {total} ({done / total:.0%})"
+            self.say(f"  {name}: {'round ' * rounds}{done}{share} {remark}".rstrip())
 
         return update
 

@@ -227,7 +227,7 @@ def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
 def rounds_of(experiment: Experiment, stages: Stages, name: str) -> AbstractContextManager:
     """A stage; it shows the progress of rounds if the inference still needs them."""
     in_rounds = experiment.inference is None and rounds.rebuilds(experiment.setup)
-    return stages.progress(name, rounds.MAX_ROUNDS) if in_rounds else stages(name)
+    return stages.progress(name, rounds.MAX_ROUNDS, rounds=True) if in_rounds else stages(name)
 
 
 def infer(experiment: Experiment, report: rounds.Report | None = None) -> rounds.Inference:

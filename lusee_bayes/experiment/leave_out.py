@@ -124,9 +124,7 @@ class GroupsCompared:
         groups = [one for one in groups if (one.data & self.left_out.present).any()]
         chi2, degrees = _judged(self.left_out.each([group.data for group in groups]))
         out = _tail(chi2, degrees) < false_alarm
-        if not out.any():
-            return None
-        return groups[np.where(out, chi2 - degrees, -np.inf).argmax()]
+        return groups[np.where(out, chi2 - degrees, -np.inf).argmax()] if out.any() else None
 
 
 def _judged(missed: list[Missed]) -> tuple[Vector, Vector]:

@@ -205,9 +205,8 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
     are: gains and sources then belong to the corrected pointing.
     """
     around = around or Around()
-    moved_setup = moved(setup, around.values, above=True)
     return [
-        (treatment, cls.build(section, moved_setup, around))
+        (treatment, cls.build(section, moved(setup, around.values, above=True), around))
         for cls, section in present(setup.scenario)
         if (treatment := cls.treatment(setup.scenario)) != "ignored"
     ]

@@ -276,8 +276,7 @@ def cache_for(chunks: tuple[int, ...] | None) -> dict[str, Any]:
     """
     if chunks is None:
         return {}
-    spectra = chunks[0] * N_PRODUCTS * (N_CHANNELS + chunks[2]) * 4
-    size = min(int(1.25 * spectra), LARGEST_CACHE)
+    size = min(int(5.0 * chunks[0] * N_PRODUCTS * (N_CHANNELS + chunks[2])), LARGEST_CACHE)
     return {"rdcc_nbytes": max(size, 1 << 20), "rdcc_nslots": PLACES, "rdcc_w0": 1.0}
 
 

@@ -75,8 +75,7 @@ class ChannelSpectra:
         beyond = (at - inside) / BEYOND
         held = inside + BEYOND * beyond / (1.0 + beyond**POWER) ** (1.0 / POWER)
         values = spline(held)
-        autos = values + (at - held)[:, None] * spline(inside, 1)
-        return cls(autos, np.zeros(len(at)), values)
+        return cls(values + (at - held)[:, None] * spline(inside, 1), np.zeros(len(at)), values)
 
     def __call__(self, visibilities: Float[np.ndarray, "nodes products rows"]) -> AllChannels:
         """Return visibilities in all channels.

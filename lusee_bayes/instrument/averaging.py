@@ -294,8 +294,7 @@ def by_the_rule(present: GridFlags, bin_of: Samples, live_s: Times) -> tuple[Bin
     share = np.add.reduceat(live_s * present, first, axis=1)
     # rounding may put an exact half slightly below it
     kept = (share >= LEAST_SHARE * total * (1.0 - 1e-12)) & (total > 0.0)
-    used = some & kept.any(axis=0)[bin_of] & (present | ~kept[:, bin_of]).all(axis=0)
-    return kept, used
+    return kept, some & kept.any(axis=0)[bin_of] & (present | ~kept[:, bin_of]).all(axis=0)
 
 
 def binned(observation: Observation, keep: TimeFlags, bin_of: Samples, to_s: float) -> Observation:

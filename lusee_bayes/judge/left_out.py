@@ -513,8 +513,7 @@ class LeftOut:
         gram = self._gram(lost_weights(self._weights, chosen.cells))
         lower = linalg.cholesky(np.subtract(self._normal, gram, out=gram), overwrite=True)
         h = linalg.solve_lower(lower, h, transpose=False)
-        directions = self._trace_of_sky(lower) - self._trace
-        return float((chosen.b**2).sum() + (h**2).sum()), directions
+        return float((chosen.b**2).sum() + (h**2).sum()), self._trace_of_sky(lower) - self._trace
 
 
 def pieces(n: int) -> list[Int[np.ndarray, " part"]]:
@@ -553,6 +552,5 @@ def lost_weights(weights: Weights, chosen: CellFlags) -> Weights:
     used = np.flatnonzero(some.any(axis=0))
     e = solve_roots(roots(within, some), np.where(some[:, used, None], within[:, used], 0.0))
     # exact to the last bit in the group's rows
-    whole = some[:, :, None] | some[:, None]
-    lost[blocks] = np.where(whole, within, e.swapaxes(1, 2) @ e)
+    lost[blocks] = np.where(some[:, :, None] | some[:, None], within, e.swapaxes(1, 2) @ e)
     return lost

@@ -115,6 +115,5 @@ def _about_crosses(data: Visibilities, values: Grid, sigma: Grid) -> tuple[str, 
             first = data.observation.times[int(np.nonzero(excess)[0][0])].isot[:19]
             larger = f"|V_{i}{j}| is larger than sqrt(V_{i}{i} V_{j}{j}), which is impossible"
             where = f"{int(excess.sum())} of {int(usable.sum())} samples (first {first})"
-            wrong = f"one of {i}{i}, {j}{j} and {i}{j} is wrong"
-            doubts.append(f"{larger}, in {where}: {wrong}.")
+            doubts.append(f"{larger}, in {where}: one of {i}{i}, {j}{j} and {i}{j} is wrong.")
     return tuple(doubts)

@@ -192,8 +192,7 @@ class Information(Described, eqx.Module):
             For data in K.
         """
         shifts = skies - self.reference
-        pulls = shifts @ self.matrix - 2.0 * self.vector
-        chi2 = self.misfit + (shifts * pulls).sum(1)
+        chi2 = self.misfit + (shifts * (shifts @ self.matrix - 2.0 * self.vector)).sum(1)
         return -0.5 * (chi2 + self.log_det + self.n_data * np.log(2.0 * np.pi))
 
     def posterior(self, prior: Prior, lower: ModesMatrix | None = None) -> Posterior:

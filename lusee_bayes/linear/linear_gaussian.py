@@ -536,8 +536,7 @@ class Whitened(Form):
         posterior = Posterior(self.model.prior, u, self.lower, self.basis, log_evidence, moved)
         parts = self.model, data, posterior, self.factor
         # if the evidence is differentiated outside of jit, the last step alone is not traced
-        traced = is_traced(*jax.tree.leaves(parts))
-        return Solution(*(parts if traced else on_host(parts)))
+        return Solution(*(parts if is_traced(*jax.tree.leaves(parts)) else on_host(parts)))
 
 
 class InMap(Whitened):

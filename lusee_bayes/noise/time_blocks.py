@@ -271,8 +271,7 @@ class TimeBandedCovariance(_OverLayout):
             return None
         self.layout.require_same(other.layout)
         wide, narrow = sorted((self.band, other.band), key=lambda b: -b.shape[1])
-        extra = wide.shape[1] - narrow.shape[1]
-        narrow = jnp.pad(narrow, ((0, 0), (0, extra), (0, 0), (0, 0)))
+        narrow = jnp.pad(narrow, ((0, 0), (0, wide.shape[1] - narrow.shape[1]), (0, 0), (0, 0)))
         return TimeBandedCovariance(wide + narrow, self.layout, self.name)
 
     def scaled(self, factor):

@@ -136,8 +136,7 @@ def _bifurcation(cases: Cases) -> Verdict:
 def zenith_dip(case: xr.Dataset) -> float:
     """How far auto 00 at the zenith is below its peak in the plane across the arm (East-West)."""
     beam = case["beam"].values[0]
-    across = beam[:, [0, beam.shape[1] // 2]]
-    return float(1.0 - beam[0].mean() / max(across.max(), beam[0].mean()))
+    return float(1.0 - beam[0].mean() / max(beam[:, [0, beam.shape[1] // 2]].max(), beam[0].mean()))
 
 
 def _skewness(cases: Cases) -> Verdict:

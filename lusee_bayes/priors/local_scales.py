@@ -252,8 +252,7 @@ class LocalScales(PriorFamily):
 
 
 def _covariance(family: LocalScales, sizes: Vector, texture: ModesMatrix) -> ModesMatrix:
-    sized = np.sqrt(sizes)[family.size_of] * family.sized
-    columns = np.concatenate([family.wide, sized], axis=1)
+    columns = np.concatenate([family.wide, np.sqrt(sizes)[family.size_of] * family.sized], axis=1)
     total = columns @ columns.T + texture
     total[np.diag_indices_from(total)] += max(family.white, LEAST_WHITE * family.mean[0] ** 2)
     return total

@@ -112,11 +112,10 @@ def describe_samples(path: Path) -> list[str]:
     # imported here because other files need no sampler
     tree = resolve_name("lusee_bayes.sampling.datatree:read_datatree")(path)
     posterior, statistics = tree["posterior"], tree["sample_stats"]
-    sites = ", ".join(f"{name} {v.shape[2:]}" for name, v in posterior.data_vars.items())
     return [
         f"{posterior.sizes['chain']} x {posterior.sizes['draw']} draws from the program "
         f"{tree.attrs['program']} at {float(tree.attrs['frequency_mhz']):g} MHz",
-        f"sites: {sites}",
+        f"sites: {', '.join(f'{name} {v.shape[2:]}' for name, v in posterior.data_vars.items())}",
         f"{int(statistics['diverging'].sum())} divergences, "
         f"{float(statistics['n_steps'].mean()):.1f} steps a trajectory",
         f"groups: {', '.join(tree.children)}",

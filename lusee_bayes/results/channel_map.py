@@ -196,8 +196,7 @@ class Conditioned:
             return data
         posterior, n_data = self.posterior, int(self.information.n_data)
         chi2 = float(self.information.chi2(posterior.mean) + posterior.prior_chi2())
-        instrument = Split.of(posterior, chi2, n_data).instrument
-        return replace(data, n_data=n_data, instrument=instrument)
+        return replace(data, n_data=n_data, instrument=Split.of(posterior, chi2, n_data).instrument)
 
     def compared(self) -> Float[np.ndarray, "more modes"] | None:
         """Draws minus the mean for :class:`.Counts`, in K; None if the truth is unknown."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from dataclasses import replace as replace_fields
 from itertools import chain
 from pathlib import Path
@@ -228,7 +229,7 @@ def _finished(path: Path, identity: dict, sampler: Sampler) -> xr.DataTree | Non
     if not same or tree["posterior"].sizes["draw"] != sampler.draws:
         raise InputError(
             f"'{path.parent}' contains a finished run with other settings or number of draws; "
-            "give another folder, or omit --resume to replace its draws"
+            "give another folder, or --force without --resume to replace its draws"
         )
     return tree
 
@@ -306,7 +307,7 @@ def run_sample(
     program = program or default_program(scenario)
     sampler = sampler or Sampler(seed=scenario.seed)
 
-    given = {"replace": replace, "program": named(program)}
+    given = {"replace": replace, **told(program, sampler)}
 
     def draw(
         channels: Mapping[str, Scenario], folder: Path, stages: Stages
@@ -343,9 +344,10 @@ def run_sample(
         return RunOutcome(results, run.path, [file for each in runs for file in each.files])
 
 
-def named(program: Program) -> str:
-    """Identify a program by its name and a digest of its text."""
-    return f"{program.name} ({program.digest[:12]})"
+def told(program: Program, sampler: Sampler) -> dict[str, object]:
+    """What determines draws besides scenario and data, by name."""
+    settings = {f"sampler's {name}": value for name, value in asdict(sampler).items()}
+    return {"program": f"{program.name} ({program.digest[:12]})", **settings}
 
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:
@@ -446,7 +448,7 @@ def run_validate(
     program = programs.load_program("sky")
     require_simulations(simulations)
     require_draws(sampler.draws)
-    given = {"replace": replace, "program": named(program)}
+    given = {"replace": replace, **told(program, sampler)}
     with run_folder(folder, VALIDATION, scenario, data, program.path, **given) as run:
         n = sampler.chains * sampler.draws
         experiment = measured_experiment(scenario, data, stages, n_draws=n)

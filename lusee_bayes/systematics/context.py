@@ -158,9 +158,7 @@ class Setup:
     @property
     def offset(self) -> DataVector | None:
         """The background in every datum, in K; None if there is none."""
-        if not np.any(self.background):
-            return None
-        return self.layout.gather(self.background)
+        return self.layout.gather(self.background) if np.any(self.background) else None
 
     def with_prior(self, section: Any) -> Setup:
         """Return the same with another prior, or family of priors.

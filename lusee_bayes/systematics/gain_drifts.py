@@ -250,8 +250,7 @@ class GainDrifts(Systematic):
 
         None for drifts so strong that their mean could be -1, which the coordinates exclude.
         """
-        sigma = float(self.drift.sigma)
-        if sigma * np.exp(3.0 * (self.log_sigma_std or 0.0)) > STRONGEST:
+        if float(self.drift.sigma) * np.exp(3.0 * (self.log_sigma_std or 0.0)) > STRONGEST:
             return None
         noise = self.layout.scatter(model.noise.diagonal())
         return GainCoordinates(self, noise.sum() / (self.visibilities**2).sum())

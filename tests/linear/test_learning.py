@@ -118,8 +118,7 @@ def test_variances_beyond_the_data_are_means_over_parameters(case):
     known = wider.start_from(case.family, np.ones(len(scores.mean))) > 0
     drawn = rng.standard_normal((n, len(known)))
     drawn[:, known] = rng.multivariate_normal(scores.mean, scores.covariance, n)
-    near = wider.hyperprior.near(np.where(known, drawn.mean(0), 0.0), drawn)
-    each = np.exp(near @ wider.basis.T)
+    each = np.exp(wider.hyperprior.near(np.where(known, drawn.mean(0), 0.0), drawn) @ wider.basis.T)
     got = np.diagonal(learning.averaged_beyond(wider, case.family, scores))[np.arange(19) ** 2]
     assert (np.abs(each.mean(0) - got) <= 4.5 * each.std(0) / np.sqrt(n)).all()
 
@@ -376,5 +375,4 @@ def test_a_level_that_only_the_tilt_makes_uncertain_is_learned():
     learned = found.prior.covariance().diagonal()
     # one of sqrt(2 / 15): of the squares of 15 modes
     assert np.abs(np.log(learned[1:seen] / expected[1:seen])).max() < 1.0
-    chosen = family.at(found.parameters).covariance.diagonal()
-    assert (learned[100:] > 1.3 * chosen[100:]).all()
+    assert (learned[100:] > 1.3 * family.at(found.parameters).covariance.diagonal()[100:]).all()

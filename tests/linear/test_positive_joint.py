@@ -179,8 +179,7 @@ def test_the_gaussian_is_that_of_one_big_model(case):
 
 def test_draws_scatter_as_the_covariance_says_and_are_positive(case):
     skies, _, seen, mode = case
-    n = 3000
-    draws = np.asarray(mode.posterior.sample(jax.random.key(1), n))
+    draws = np.asarray(mode.posterior.sample(jax.random.key(1), 3000))
     spread = paired(mode.posterior.covariance(), mode.prior)
     sky = pj.positive_sky(mode, 0, seen[0][-1], spread, draws, jax.random.key(2))
     width = np.sqrt(np.diagonal(sky.covariance))

@@ -90,8 +90,7 @@ def test_the_scatter_is_that_of_simulated_skies(ensemble):
             if name == "held":
                 off = (values.mean(0) - LEVELS) / (values.std(0) / np.sqrt(len(values)))
                 assert np.abs(off).max() < 4.0
-        independent = np.sqrt(0.68 * 0.32 / found[0][k].n)
-        assert found[0][k].scatter[1] > 2.0 * independent
+        assert found[0][k].scatter[1] > 2.0 * np.sqrt(0.68 * 0.32 / found[0][k].n)
         above = np.mean([bands[k].largest > bands[k].allowed for bands in found])
         # 5 % +- 2.4 % of 80 skies, and as much for the quantile of 100 draws
         assert above == pytest.approx(0.05, abs=0.12)

@@ -51,8 +51,7 @@ def test_index_and_turnover_are_those_of_a_parabola():
     # the first has none in the band; d ln T / dx = 0 at x = -b / 2 c
     turnover = 10.0 * np.exp(-1.0 / 3.0)
     gradient = np.array([0.0, 1.0, -2.0 / 3.0]) / 3.0
-    normal = np.linalg.inv(weighted.T @ weighted)
-    expected = turnover * np.sqrt(gradient @ normal @ gradient)
+    expected = turnover * np.sqrt(gradient @ np.linalg.inv(weighted.T @ weighted) @ gradient)
     assert found.maps["turnover"][1] == pytest.approx(turnover, abs=0.1 * expected)
     assert found.maps["turnover_std"][1] == pytest.approx(expected, rel=0.06)
     assert np.isnan(found.maps["turnover"][[0, 2]]).all()

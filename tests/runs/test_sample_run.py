@@ -210,9 +210,10 @@ def test_resuming_a_finished_run_takes_it_over(whole, tree, no_sampling):
 
 @pytest.mark.parametrize("change", [{"draws": 500}, {"draws": 2000}, {"seed": 7}], ids=str)
 def test_a_finished_run_of_other_settings_is_not_taken_over(experiment, whole, no_sampling, change):
-    before = content(whole)
-    given = {"": experiment}, lb.load_program("sky"), replace(SAMPLER, **change), whole
-    refuse("finished run.*other settings.*omit", sample_together, *given, resume=True)
+    before, other = content(whole), replace(SAMPLER, **change)
+    given = {"": experiment}, lb.load_program("sky"), other, whole
+    refuse("finished run.*other settings.*--force", sample_together, *given, resume=True)
+    refuse("sampler's .* was .*, now", lb.run_sample, experiment.scenario, whole, sampler=other)
     assert content(whole) == before
 
 

@@ -142,9 +142,8 @@ def test_residuals_are_those_of_the_data_less_the_mean(small_experiment):
     less = replace(data, data=data.data - np.asarray(setup.coupling @ mean))
     solutions = about_mean.condition(data.data), about_zero.condition(less.data)
     one, other = (solution.posterior for solution in solutions)
-    sigma = np.asarray(one.std())
     # both means are refined to 1e-6 sigma
-    assert np.abs((one.mean - mean - other.mean) / sigma).max() < 1e-5
+    assert np.abs((one.mean - mean - other.mean) / np.asarray(one.std())).max() < 1e-5
     first, second = map(residuals, solutions, (data, less))
     for part in ("instrument", "prior"):
         a, b = getattr(first.split, part), getattr(second.split, part)

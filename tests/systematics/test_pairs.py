@@ -99,8 +99,7 @@ def test_sampled_drifts_multiply_what_is_marginalised_once(other):
 
 def test_beam_errors_follow_the_prior_that_is_learned():
     """dA S dA^T of the expected prior would be that of a sky of another strength."""
-    scenario = small_scenario(ISOTROPIC, "noise.beam.shift_mhz=1", lmax=4, cycles=0.3)
-    experiment = lb.build(scenario)
+    experiment = lb.build(small_scenario(ISOTROPIC, "noise.beam.shift_mhz=1", lmax=4, cycles=0.3))
     found, n = lb.infer(experiment), len(experiment.data.data)
     assert experiment.learned.noise_factor == 1.0
     assert abs(float(found.solution.chi2) - n) < 4.0 * np.sqrt(2.0 * n)

@@ -188,8 +188,7 @@ def test_simulated_data_hold_the_drawn_fluxes():
 def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
     given = sets("lmax=6", "observation.runs.0.cycles=0.02", "sky.sources=false", LIST)
     assert run("map", "fiducial", "-v", "-o", tmp_path, *given) == 0
-    printed = capsys.readouterr().out
-    assert "Polaris: 20000 +- 10000 Jy (prior: never above the horizon)" in printed
+    assert "Polaris: 20000 +- 10000 Jy (prior: never above the horizon)" in capsys.readouterr().out
     rows = table_of(tmp_path / "sources.csv")
     table = flux_table(experiment(), lb.infer(experiment()))
     assert list(rows[0]) == ["frequency_mhz", *table.columns]

@@ -51,8 +51,7 @@ def test_the_program_is_the_exact_product_of_gains():
     gains = 0.05 * shape * white @ np.exp(-(((hours[None] - grid[:, None]) / 10.0) ** 2))
     seen = np.asarray(setup.coupling.dense()) @ sky
     for k, (i, j) in enumerate(PAIRS):
-        at = slice(k * len(hours), (k + 1) * len(hours))
-        seen[at] *= (1 + gains[i]) * (1 + gains[j])
+        seen[slice(k * len(hours), (k + 1) * len(hours))] *= (1 + gains[i]) * (1 + gains[j])
     expected = norm.logpdf(white).sum()
     expected += norm.logpdf(sky, 0, np.sqrt(np.asarray(setup.prior.variance()))).sum()
     sigma = np.sqrt(np.asarray(radiometer(setup).diagonal()))

@@ -81,8 +81,7 @@ def named_parts(name: str, drawn: Figure | dict[str, Figure] | None) -> dict[str
     """Figures by file name: ``maps``, or ``maps_1_truth`` and so on if there are several."""
     if not isinstance(drawn, dict):
         return {} if drawn is None else {name: drawn}
-    titles = [re.sub(r"[^\w.]+", "_", title) for title in drawn]
-    numbered = zip(titles, drawn.values(), strict=True)
+    numbered = zip([re.sub(r"[^\w.]+", "_", title) for title in drawn], drawn.values(), strict=True)
     return {f"{name}_{k}_{title}": figure for k, (title, figure) in enumerate(numbered, 1)}
 
 

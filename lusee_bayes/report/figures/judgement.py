@@ -86,8 +86,15 @@ def groups_by_frequency(result: MapResult) -> Figure | None:
 
 # days whose errors exceed this multiple of the median are not shown: they would hide the others
 TOO_WIDE = 20.0
-# units by the ending of an offset's name
-UNITS = {"s": "s", "day": "s/day", "deg": "degrees"}
+# units by the ending of an unknown's name
+UNITS = {"s": "s", "day": "s/day", "deg": "degrees", "m": "m", "k": "K"}
+
+
+def in_words(name: str, unit: str = "") -> str:
+    """Name of an unknown, with its unit, for figures."""
+    kind, _, ending = name.rpartition("_")
+    kind, unit = (kind, UNITS[ending]) if ending in UNITS else (name, unit)
+    return kind.replace("_", " ") + (f" [{unit}]" if unit else "")
 
 
 def pointing_by_day(result: MapResult) -> Figure | None:
@@ -108,8 +115,7 @@ def pointing_by_day(result: MapResult) -> Figure | None:
         for value, std in whole[["value", "std"]].to_numpy():
             axes.axhspan(value - std, value + std, color=drawing.ORANGE, alpha=0.3)
             axes.axhline(value, color=drawing.ORANGE)
-        kind, _, unit = name.rpartition("_")
-        axes.set_ylabel(f"{kind.replace('_', ' ')} [{UNITS.get(unit, unit)}]")
+        axes.set_ylabel(in_words(name))
     panels[0, 0].plot([], [], color=drawing.ORANGE, label="all days together")
     panels[0, 0].legend(loc="upper right", ncols=2, frameon=False)
     panels[-1, 0].set_xlabel("days since the first sample")
@@ -118,8 +124,9 @@ def pointing_by_day(result: MapResult) -> Figure | None:
 
 
 PANELS_IN_A_ROW = 4
-# a prior that varies by more than this factor with frequency would hide the errors
-WIDE = 3.0
+# a prior that varies by more than the first factor with frequency, or is wider than the errors by
+# more than the second, would hide them
+WIDE, BROAD = 3.0, 30.0
 
 
 def unknowns_by_frequency(result: MapResult) -> Figure | None:
@@ -140,10 +147,15 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
         axes.errorbar(f, value, std, color=drawing.BLUE, fmt=".", ms=5, lw=1.2, label="posterior")
         if "true" in rows:
             axes.plot(f, rows["true"].to_numpy(), "x", color=drawing.ORANGE, ms=5, label="truth")
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-        axes.set(title=name, xlabel="frequency [MHz]", ylabel=rows["unit"].iloc[0])
+        drawing.plain_ticks(axes, 5)
+        axes.set(title=in_words(name, rows["unit"].iloc[0]), xlabel="frequency [MHz]")
         if prior.min() > 0.0 and prior.max() > WIDE * prior.min():
             axes.set_yscale("log")
+        elif before.min() > BROAD * std.max() > 0.0:
+            true = rows["true"].to_numpy() if "true" in rows else value
+            low, high = np.minimum(value - 2 * std, true), np.maximum(value + 2 * std, true)
+            room = std.max()
+            axes.set_ylim(low.min() - room, high.max() + room)
     for axes in panels.flat[len(unknowns) :]:
         axes.set_axis_off()
     handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -186,12 +198,12 @@ def corner(result: MapResult) -> Figure | None:
             axes.set_axis_off()
         elif i == j:
             before = np.exp(-0.5 * ((x - prior[i]) / wide[i]) ** 2)
-            axes.plot(x, before, color=drawing.GREY, alpha=0.5)
-            axes.plot(x, np.exp(-0.5 * x**2), color=drawing.BLUE)
-            axes.axvline(true[i], color=drawing.ORANGE, lw=1)
+            axes.plot(x, before, color=drawing.GREY, alpha=0.5, label="prior")
+            axes.plot(x, np.exp(-0.5 * x**2), color=drawing.BLUE, label="posterior")
+            axes.axvline(true[i], color=drawing.ORANGE, lw=1, label="truth")
             name, unit, value, std = table.iloc[i][["unknown", "unit", "value", "std"]]
             numbers = with_error(value, std).replace(" +-", "\n±")
-            axes.set_title(f"{name.replace('_', ' ')}\n{numbers} {unit}", fontsize=7)
+            axes.set_title(f"{in_words(name, unit)}\n{numbers}", fontsize=7)
         else:
             axes.set(ylim=(-half, half), yticks=ticks if j == 0 else [])
             r = theta.correlation[i, j]
@@ -201,9 +213,13 @@ def corner(result: MapResult) -> Figure | None:
                 axes.plot(*pair, color=drawing.GREY, alpha=0.5, lw=1.2 / k)
                 axes.plot(k * across, k * up, color=drawing.BLUE, lw=1.2 / k)
             axes.plot(true[j], true[i], "x", color=drawing.ORANGE, ms=6)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    place = {"loc": "outside lower center", "ncols": min(n, 3), "fontsize": 8, "frameon": False}
+    known = 2 + ("true" in table)
+    figure.legend(handles[:known], labels[:known], **place)
     suffix = "" if result.single else f" (channel of {channel.frequency_mhz:g} MHz)"
-    figure.suptitle(f"Unknowns of the instrument{suffix}", fontsize=10)
-    figure.supxlabel("posterior standard deviations from the mean", fontsize=9)
+    scale = "in posterior standard deviations from the mean"
+    figure.suptitle(f"Unknowns of the instrument{suffix}\n{scale}", fontsize=9)
     return figure
 
 

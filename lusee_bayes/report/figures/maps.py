@@ -376,7 +376,7 @@ def fidelity(cube: MapResult) -> Figure | Panels:
     with_truth = cube.stacked("snr") is not None
     values = cube.stacked("snr" if with_truth else "prior_fraction")
     label = r"$\mathrm{SNR}_\ell$" if with_truth else "fraction of the variance from the prior"
-    norm = LogNorm(0.3, 30.0) if with_truth else Normalize(0.0, 1.0)
+    norm = LogNorm(0.3, max(30.0, values[:, 1:].max())) if with_truth else Normalize(0.0, 1.0)
     figure, (left, right) = drawing.framed((12, 4.4), 1, 2)
     ell, channel = np.arange(values.shape[1]), np.arange(values.shape[0])
     style = {"norm": norm, "cmap": drawing.SEQUENTIAL, "shading": "nearest"}
@@ -384,7 +384,7 @@ def fidelity(cube: MapResult) -> Figure | Panels:
     ticks = _few_of(len(channel), 8)
     left.set_yticks(ticks, [f"{cube.frequencies_mhz[k]:g}" for k in ticks])
     left.set(xlabel=r"multipole $\ell$", ylabel="frequency [MHz]", title=label)
-    figure.colorbar(image, ax=left, label=label, extend="both" if with_truth else "neither")
+    figure.colorbar(image, ax=left, label=label, extend="min" if with_truth else "neither")
     right.plot(ell[1:], values[:, 1:].mean(0), color=BLUE, label="this run")
     if with_truth and cube.stacked("independent") is not None:
         alone = np.mean([channel.spectra()["snr_independent"] for channel in cube.channels], 0)

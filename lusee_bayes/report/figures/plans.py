@@ -35,8 +35,7 @@ def forecasts(planned: Sequence[Forecast]) -> Figure:
     for number, source in enumerate(sources):
         mine = [f for f in planned if f.variation.source == source]
         # side by side, so that equal values do not overlap
-        lower = 0.2 * (number - (len(sources) - 1) / 2)
-        places = {row: y + lower for row, y in rows.items()}
+        places = {row: y + 0.2 * (number - (len(sources) - 1) / 2) for row, y in rows.items()}
         for name, axis in zip(PANELS, axes, strict=True):
             _marks(axis, name, mine, places, STYLES[number % len(STYLES)], len(sources) == 1)
     for label, axis in zip(PANELS.values(), axes, strict=True):
