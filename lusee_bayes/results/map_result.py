@@ -241,7 +241,7 @@ class MapResult(Described):
         if self.single:
             return ", ".join(self.channel.figures())
         kind = "solved independently" if self.joint is None else "one posterior"
-        if self.scenario.shared and self.joint is None:
+        if self.scenario.shared and self.joint is None and len(self.channels) > 1:
             kind += " except for the instrument that they share"
         parts = [f"{counted(len(self.channels), 'frequency', 'frequencies')}, {kind}"]
         crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]

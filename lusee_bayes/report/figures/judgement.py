@@ -18,7 +18,7 @@ from lusee_bayes.judge.chi2 import probability
 from lusee_bayes.report.figures import drawing
 from lusee_bayes.results.map_result import MapResult
 
-# residuals beyond this have the darkest colours
+# residuals beyond this, or beyond 98 % of them, have the darkest colours
 WIDEST = 4.0
 # smaller p-values are drawn at this value
 LEAST_P = 1e-10
@@ -35,7 +35,8 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True, gridspec_kw=places)
     # samples need not be evenly spaced, e.g. between runs or without nights
     x, y = np.arange(len(hours) + 1) - 0.5, np.arange(len(labels) + 1) - 0.5
-    style = {"cmap": drawing.DIVERGING, "norm": Normalize(-WIDEST, WIDEST), "rasterized": True}
+    widest = max(WIDEST, float(np.nanpercentile(np.abs(z), 98)))
+    style = {"cmap": drawing.DIVERGING, "norm": Normalize(-widest, widest), "rasterized": True}
     image = left.pcolormesh(x, y, z, **style)
     days = np.asarray(hours) / 24.0
     ticks = MaxNLocator(7).tick_values(days[0], days[-1])

@@ -212,8 +212,8 @@ def map_fidelity(channels: Mapping[str, ChannelResult]) -> Panels:
     lmax = max(columns["ell"][-1] for columns in spectra.values())
     for axes in (*fidelity, share):
         axes.set(xlabel=r"multipole $\ell$", xlim=(1, lmax))
-    if len(channels) > 1:
-        share.legend(frameon=False, fontsize=8)
+        if len(channels) > 1:
+            axes.legend(frameon=False, fontsize=8)
     return {name: figure for name, (figure, _) in drawn.items()}
 
 
