@@ -498,10 +498,11 @@ def spectrum_command(
     say(f"{region} (share: of the variance that would vanish if it were known; shares overlap)")
     say(table_of_numbers(*spectrum.rows(region)), *(limit.sentence() for limit in limits))
     if figure is not None:
-        from lusee_bayes.core.files import replacing
+        from lusee_bayes.core.files import replacing, require_new
         from lusee_bayes.report.figures.drawing import save
         from lusee_bayes.report.figures.maps import spectrum_figure
 
+        require_new(figure, replace=False)
         with replacing(figure) as path:
             save([(path, spectrum_figure(spectrum, table))], 150)
         say(f"spectrum -> {figure}")

@@ -13,13 +13,27 @@ from typing import Any
 
 import numpy as np
 
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, refusing
 from lusee_bayes.core.lazy import jax
 
 
 def is_traced(*arrays: Any) -> bool:
     """Return whether any of ``arrays`` is a tracer, whose values are not known yet."""
     return any(isinstance(a, jax.core.Tracer) for a in arrays)
+
+
+def in_unit(name: str, value: Any, unit: str) -> Any:
+    """Return the number of an astropy Quantity in this unit; anything else as it is.
+
+    Raises
+    ------
+    InputError
+        If the Quantity has a unit of another kind.
+    """
+    if not hasattr(value, "to_value"):
+        return value
+    with refusing(f"{name} is in '{value.unit}', expected {unit}", TypeError):
+        return value.to_value(unit)
 
 
 def require_whole(name: str, value: Any, least: int, most: int) -> None:

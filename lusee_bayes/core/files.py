@@ -106,7 +106,7 @@ def require_new(path: str | Path, *, replace: bool, inputs: Iterable[str | Path]
     require_target(path)
     require_apart(user_path(path), inputs)
     if not replace and user_path(path).exists():
-        raise InputError(f"'{path}' exists already; give another name, or --force")
+        raise InputError(f"'{path}' exists already; remove it, give another name, or --force")
 
 
 def _require_name(path: Path) -> None:

@@ -556,6 +556,8 @@ def _merged(proposals: list[Proposal]) -> Iterator[Proposal]:
 def _finer(judge: UnderAnySky) -> Iterator[Proposal]:
     """Try a map with a larger lmax."""
     setup, lmax = judge.setup, judge.setup.scenario.lmax + MORE_ELLS
+    if setup.hidden is not None:  # what the terrain hides is known up to lmax
+        return
     try:
         beams = setup.beam_source.beams(setup.scenario.frequency_mhz, lmax)
     except InputError:  # the beams of a file end at a lower ell

@@ -36,7 +36,14 @@ from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.registered import present
 from lusee_bayes.systematics.regolith import ground_per_kelvin
 from lusee_bayes.systematics.sources import source_responses
-from lusee_bayes.systematics.systematic import Expanded, Marginalised, Scale, Systematic, Truth
+from lusee_bayes.systematics.systematic import (
+    ChangedBeams,
+    Expanded,
+    Marginalised,
+    Scale,
+    Systematic,
+    Truth,
+)
 
 # sites closer than this, 30 m, count as one
 SAME_SITE_DEG = 1e-3
@@ -244,6 +251,9 @@ def in_noise(
     last, held = model.coupling.response, []
     for systematic, before, response in stages:
         later = last if response is None or last is None else last / response
+        if isinstance(systematic, ChangedBeams):  # of the antennas as they point
+            turned = before.coupling.of(pointing=model.coupling.pointing)
+            before = replace(before, coupling=turned)
         if systematic.first_order:
             held.append(on_host(Expanded.at(systematic, before, around, later)))
         else:

@@ -61,8 +61,9 @@ ENOUGH = 8
 # a prior is first learned when the map moves by less than NEARLY, and last when learning it again
 # moves the map by less than PRIOR_SETTLED; a rejected step of learning moves it by 0.01
 NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
-# number of noise draws, always the same, that estimate the volume of skies that fit
-VOLUME_DRAWS = 8
+# number of noise draws, always the same, that estimate the volume of skies that fit, the standard
+# errors that the slope must exceed, and the largest modes x unknowns for the exact one
+VOLUME_DRAWS, VOLUME_DOUBT, EXACT_VOLUME = 8, 3.0, 1500
 # relative rms by which the visibilities may be off around which drifts of the gains are inferred
 SAME_VISIBILITIES = 0.1
 # steps that oscillate are halved, down to this fraction of the full step
@@ -428,7 +429,8 @@ def _around(
         return around, step, None
     # with the unknowns at these values: the sky that they would hide scatters without bound
     exact = _exact(setup, around)
-    return replace(around, volume=_volume(exact.solution)), step, exact
+    n_unknowns = sum(len(part.centre) for part in inference.expanded)
+    return replace(around, volume=_volume(exact.solution, n_unknowns)), step, exact
 
 
 def _beginning(setup: Setup, around: Around) -> Around:
@@ -457,12 +459,16 @@ def _tempered(misfit: float, rounds: int) -> float:
     return 1.0 if tempered < 2.0 or rounds >= MAX_TEMPERED_ROUNDS else tempered
 
 
-def _volume(solution: Solution) -> Volume:
-    """:attr:`.Around.volume`."""
+def _volume(solution: Solution, n_unknowns: float | int = np.inf) -> Volume:
+    """:attr:`.Around.volume`: exact for a small problem."""
+    if (n := solution.model.prior.size) * n_unknowns <= EXACT_VOLUME:
+        root = np.asarray(solution.posterior.root())
+        seen = np.asarray(solution.factor.solve(solution.model.coupling.dense() @ root))
+        return root.T, n * seen.T, 0.0
     white = np.random.default_rng(0).standard_normal((solution.model.n_data, VOLUME_DRAWS))
     weighted = np.asarray(solution.factor.whiten_transpose(white))
     pulls = np.asarray(solution.model.coupling.transpose_mv(weighted))
-    return (solution.covariance @ pulls).T, weighted.T
+    return (solution.covariance @ pulls).T, weighted.T, VOLUME_DOUBT
 
 
 def rebuilds(setup: Setup) -> bool:

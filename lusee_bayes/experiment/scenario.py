@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
 from itertools import pairwise
@@ -204,6 +204,14 @@ class Scenario(Section):
     output: OutputSection = OutputSection()
     seed: Seed = 1
     instrument_seed: Seed | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_frequency_is_no_list(cls, tree: Any) -> Any:
+        many = tree.get("frequencies_mhz") if isinstance(tree, Mapping) else None
+        if isinstance(many, Sequence) and len(many) == 1 and not tree.get("joint"):
+            return {**tree, "frequency_mhz": many[0], "frequencies_mhz": ()}
+        return tree
 
     @field_validator("nside")
     @classmethod

@@ -496,7 +496,7 @@ def given_data(table: pd.DataFrame, amplitudes: Amplitudes) -> pd.DataFrame:
 
 def _alone(experiment: Experiment, inference: Inference, part: Expanded) -> pd.DataFrame:
     """The table of one systematic."""
-    truth = None if experiment.data.truth is None else true_values(experiment.setup)
+    truth = None if experiment.setup.measured else true_values(experiment.setup)
     return given_data(before_data([part], truth), inference.amplitudes(part))
 
 

@@ -6,7 +6,7 @@ The section ``flight`` of a scenario is defined here; a recipe is this section w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
@@ -309,6 +309,11 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
         # a spectrum of no frames has no data, whatever its live time
         live_s = np.where(share > 0.0, share, 1.0) * window
         windows = contiguous(times, window / 2.0, float(window.min()), live_s)
+        # a spectrum during which the turntable turns belongs to no angle
+        ends = (recipe.section.angles_at(later(times, s * window / 2.0)) for s in (-1.0, 1.0))
+        turns = np.split(np.not_equal(*ends), np.cumsum([s.n_rows for s in ordered])[:-1])
+        pairs = zip(ordered, turns, strict=True)
+        ordered = tuple(replace(s, share=np.where(turn, 0.0, s.share)) for s, turn in pairs)
     # a state has one Navgf, length, angle and set of gains; compared as text, like the levels
     session = np.repeat(np.arange(len(ordered)), [s.n_rows for s in ordered])
     settings = [np.column_stack([s.navgf, s.navg_shift, s.level]) for s in ordered]
@@ -330,8 +335,8 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
 def _site(sessions: Sequence[Session]) -> tuple[float, float]:
     first = sessions[0]
     for other in sessions[1:]:
-        differ = max(abs(other.lon_deg - first.lon_deg), abs(other.lat_deg - first.lat_deg))
-        if differ > SAME_SITE_DEG:
+        east = (other.lon_deg - first.lon_deg + 180.0) % 360.0 - 180.0
+        if max(abs(east), abs(other.lat_deg - first.lat_deg)) > SAME_SITE_DEG:
             raise InputError(
                 f"{first.path} is at longitude {first.lon_deg:g}, latitude {first.lat_deg:g} "
                 f"degrees, {other.path} at {other.lon_deg:g}, {other.lat_deg:g}; if the site in "

@@ -217,7 +217,10 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
         channels = raw * factor / (root[:, session.FIRST_PORT] * root[:, session.SECOND_PORT])
         if recipe.section.sign < 0:
             channels[:, session.IMAGINARY] *= -1.0
-        finite = np.isfinite(channels)
+        finite, autos = np.isfinite(channels), channels[:, session.AUTOS]
+        # a port whose auto is nowhere positive has no data, as one without an auto
+        dead = ((autos <= 0.0) & np.isfinite(autos)).any(axis=2) & ~(autos > 0.0).any(axis=2)
+        finite &= ~(dead[:, session.FIRST_PORT] | dead[:, session.SECOND_PORT])[..., None]
         present, with_auto = finite.any(axis=2), finite[:, session.AUTOS]
         # a bin is whole if all products that are present are finite in it
         whole = (finite | ~present[..., None]).all(axis=1) & with_auto.any(axis=(1, 2))[:, None]

@@ -133,6 +133,9 @@ def utc_times(times: Any) -> Time:
         If they are not times, or outside the ephemeris.
     """
     if isinstance(times, Time):
+        if times.masked or times.scale in ("ut1", "local"):
+            kind = "masked" if times.masked else f"in {times.scale}"
+            raise InputError(f"times are {kind}; give all of them, in {', '.join(SCALES)}")
         require_ephemeris(np.ravel(times.jd))
         with unannounced_leap_seconds():
             return times.reshape(-1).utc

@@ -60,7 +60,9 @@ def _utc_of_jd(content: Content) -> Time:
 
 
 def _datetimes(times: Time) -> np.ndarray:
-    return times.isot.astype("datetime64[ms]")
+    # of the standard form, whatever that of the given times; datetime64 has no leap seconds
+    plain = Time(times.jd1, times.jd2, format="jd", scale=times.scale, precision=3)
+    return np.char.replace(plain.isot, ":60.", ":59.").astype("datetime64[ms]")
 
 
 def read_windows(content: Content, times: Time) -> tuple[Time, Windows | None]:
@@ -270,6 +272,10 @@ class Visibilities(checks.Described):
         InputError
             If arrays are inconsistent with each other or with their description.
         """
+        data = checks.in_unit("the data", data, "K")
+        frequency_mhz = checks.in_unit("frequency_mhz", frequency_mhz, "MHz")
+        live_s, step_s = (checks.in_unit("a length of time", x, "s") for x in (live_s, step_s))
+        turntable_deg = checks.in_unit("turntable_deg", turntable_deg, "deg")
         values = real_products(data, products, flags, convention, n_antennas)
         utc = utc_times(times)
         if len(utc) != values.shape[1]:

@@ -157,12 +157,17 @@ class AmplitudesOfSky:
                 alike = np.flatnonzero((root[:FEW] == column[:FEW, None]).all(0)).tolist()
                 at.append(next(k for k in alike if k not in at and (root[:, k] == column).all()))
             left = cho_solve((np.asarray(factor.lower), True), np.eye(root.shape[1])[:, at])
-            solved, covariance = factor.base.whiten_transpose(factor.v @ left), left[at]
+            half = factor.v @ left
+            solved, covariance = factor.base.whiten_transpose(half), left[at]
+            residual = solution.data - model.predict(solution.posterior.mean)
+            # T^T N^-1 r would lose the digits that the data add to a wide prior
+            mean = half.T @ np.asarray(factor.base.whiten(np.asarray(residual)))
         else:
             solved = np.asarray(factor.solve(t))
             covariance = np.eye(t.shape[1]) - t.T @ solved
+            mean = t.T @ solution.weighted_residual()
         pull = np.asarray(model.coupling.transpose_mv(np.asarray(solved))).T
-        return cls(t.T @ solution.weighted_residual(), pull, covariance, solution.posterior.mean)
+        return cls(mean, pull, covariance, solution.posterior.mean)
 
     def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
         """Integrate out a sky N(mean, covariance), in K and K^2, given any additional data."""

@@ -214,7 +214,15 @@ def _dense(coupling: Coupling, _: covariance.Covariance, factor: covariance.Fact
     return gram_matrix(np.asarray(factor.whiten(coupling.dense())))
 
 
-def _within_times(coupling: CouplingMatrix, noise: covariance.Covariance, _) -> ModesMatrix:
+# inverses of blocks with a larger collinearity lose digits that whitened data keep
+MOST_COLLINEAR = 1e5
+
+
+def _within_times(
+    coupling: CouplingMatrix, noise: covariance.Covariance, factor: covariance.Factor
+) -> ModesMatrix:
+    if factor.collinearity > MOST_COLLINEAR:
+        return _dense(coupling, noise, factor)
     return summed(coupling, noise.time_weights(coupling.layout))
 
 

@@ -332,8 +332,9 @@ def positive_sky(
 ) -> joint.ChannelSky:
     """Compute the sky of one channel.
 
-    The mean is the sky of the mean exponent, and draws are the skies of drawn exponents: positive
-    on the grid, except for point sources. The covariance is W C W^T, with the exponent's C.
+    The mean is the sky of the mean exponent, and the covariance C_s = W C W^T, with the exponent's
+    C. A draw is the sky s of a drawn exponent less C_s M (s - s_1), with s_1 linear in the
+    exponent: what the exponential adds against the data. It is positive where they say little.
 
     Parameters
     ----------
@@ -360,7 +361,8 @@ def positive_sky(
     joint_sky = joint.channel_sky(mode.prior, channel, relative, unknowns, spread, draws, key)
     beside = diffuse_part(skies, channel, information)
     slope = _slope(skies, channel, exponent)
-    covariance = beside.whole_covariance(symmetric_product(slope @ joint_sky.covariance, slope.T))
+    of_diffuse = symmetric_product(slope @ joint_sky.covariance, slope.T)
+    covariance = beside.whole_covariance(of_diffuse)
     shape = len(draws), len(beside.patterns)
     flux_key = jax.random.fold_in(jax.random.fold_in(key, channel), 1)
     z = np.asarray(jax.random.normal(flux_key, shape, dtype=jnp.float64))
@@ -368,6 +370,9 @@ def positive_sky(
     found = np.concatenate([joint_sky.mean[None], joint_sky.draws])
     chunks = [found[first : first + CHUNK] for first in range(0, len(found), CHUNK)]
     diffuse = np.concatenate([_whole(skies, channel, chunk) for chunk in chunks])
+    # the exponential adds to the linear sky only what the data leave open
+    more = diffuse - diffuse[:1] - (found - found[:1]) @ slope.T
+    diffuse -= more @ np.asarray(beside.without().matrix) @ of_diffuse
     whole = beside.whole_skies(diffuse, np.pad(z, ((1, 0), (0, 0))))
     return joint.ChannelSky(whole[0], covariance, whole[1:])
 

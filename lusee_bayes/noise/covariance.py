@@ -47,9 +47,12 @@ class Factor(eqx.Module):
     couples_times : bool
         Whether N may couple different times. If not, every whitened entry depends only on data of
         its time.
+    collinearity : float
+        Largest variance of a datum over that which others leave, where blocks would be inverted.
     """
 
     couples_times: ClassVar[bool] = True
+    collinearity = 1.0
 
     @abstractmethod
     def whiten(self, x: Columns) -> Columns:

@@ -72,7 +72,7 @@ Scalar = float | int | Float[Array, ""]
 
 RADIOMETER_FORMS = ("paper", "exact")
 # smallest eigenvalue of T over the largest: that of the products' covariance is about its square
-LEAST_EIGENVALUE = 1e-4
+LEAST_EIGENVALUE = 1e-5
 
 
 def radiometer_noise(
@@ -123,7 +123,7 @@ def radiometer_noise(
     visibilities = without_gaps(visibilities, layout)
     checks.require_finite("the visibilities", visibilities)
     autos = visibilities[auto_indices(round(np.sqrt(layout.n_products)))]
-    hint = "it sets the noise level; use a sky with a positive mean"
+    hint = "it sets the noise level; flag these samples, or use a sky with a positive mean"
     checks.require_positive("the antenna temperature (autos of the visibilities)", autos, hint)
     scale = factor / (bandwidth_hz * step_s * duty_cycle)
     if np.ndim(scale):

@@ -69,6 +69,11 @@ class TimeBlockFactor(CholeskyFactor):
     couples_times: ClassVar[bool] = False
     layout: DataLayout
 
+    @property
+    def collinearity(self):
+        own = namespace(self).diagonal(self.lower, axis1=1, axis2=2)
+        return float(((self.lower**2).sum(2) / own**2).max())
+
     def _columns(self, x):
         return self.layout.by_time(x)
 

@@ -186,6 +186,7 @@ class ChannelInformation:
         mean, covariance, drawn = sky.mean[:n], sky.covariance[:n, :n], sky.draws[:, :n]
         if tied is not None:
             unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
+        if unknowns is not None:
             data = data.given(unknowns.table(mean, covariance))
         return channel_result(
             data,

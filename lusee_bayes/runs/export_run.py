@@ -108,6 +108,7 @@ def write_skyh5(run: str | Path, path: str | Path) -> RunOutcome[list[str]]:
         If ``run`` is not the folder of a map run.
     """
     finished, path = FinishedRun.read(run), files.user_path(path)
+    files.require_new(path, replace=False)
     stokes_i = np.stack([channel.maps()["mean"] for channel in finished.channels])
     text = {"component_type": "healpix", "spectral_type": "full", "hpx_order": "ring"}
     text |= {"hpx_frame/frame": "galactic", "history": f"lusee_bayes {__version__}: {run}"}

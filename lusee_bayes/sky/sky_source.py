@@ -16,9 +16,11 @@ has FREQ_START, FREQ_END and FREQ_STEP in MHz. The file does not state its frame
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import h5py
@@ -31,7 +33,7 @@ from lusee_bayes.core.arrays import Array, Modes, Pixels
 from lusee_bayes.core.checks import Described, number, require_array, require_whole
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import has_words, is_fits, opened, require_readable_hdf5
+from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import naming, read_arrays, reading, require_file
@@ -203,7 +205,7 @@ class SkyMap(SkyFile):
     @property
     def unseen(self) -> Bool[np.ndarray, " pixels"]:
         """Which pixels have no data."""
-        return np.isclose(self.pixels, UNSEEN, rtol=1e-6)
+        return _is_unseen(self.pixels)
 
     def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
         if self.unseen.any():
@@ -241,7 +243,13 @@ def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
                 f"{nearest(dataset, names)} Set the key dataset"
             )
         units = {f"{dataset}.units": file[dataset].attrs.get("units")}
-        return _layout(dataset).checked(path, {dataset: file[dataset]}, units).arrays[dataset]
+        values = _layout(dataset).checked(path, {dataset: file[dataset]}, units).arrays[dataset]
+        return np.where(_is_unseen(file[dataset][()]), UNSEEN, values)
+
+
+def _is_unseen(pixels: np.ndarray) -> Bool[np.ndarray, "..."]:
+    # in the file's unit and precision
+    return np.isclose(pixels, UNSEEN, rtol=1e-6)
 
 
 def _read_map(path: Path) -> np.ndarray:
@@ -250,12 +258,25 @@ def _read_map(path: Path) -> np.ndarray:
             raise InputError(
                 f"{path} has no binary table; expected a HEALPix FITS map (or ULSA HDF5)"
             )
-        header, column = tables[0].header, tables[0].columns[0]
+        header = tables[0].header
+        listed = str(header.get("INDXSCHM")).strip().upper() == "EXPLICIT"
+        column = tables[0].columns[int(listed)]
         # healpy writes rows of 1024 pixels
-        given = {column.name: np.ravel(tables[0].data.field(0))}
+        given = np.ravel(tables[0].data.field(int(listed)))
         units = {f"{column.name}.units": column.unit}
-        values = _layout(column.name).checked(path, given, units).arrays[column.name]
-    ordering = str(header.get("ORDERING", "absent")).strip().upper()
+        values = _layout(column.name).checked(path, {column.name: given}, units).arrays[column.name]
+        values = np.where(_is_unseen(given), UNSEEN, values)
+        if listed:  # of some pixels only
+            some = values
+            values = np.full(12 * int(header["NSIDE"]) ** 2, UNSEEN)
+            values[np.ravel(tables[0].data.field(0))] = some
+    _require_ring(path, header, "absent")
+    return values
+
+
+def _require_ring(path: str | Path, header: Mapping[str, Any], ordering: str) -> None:
+    """Check that pixels are RING and Galactic; ``ordering``: what a header without it means."""
+    ordering = str(header.get("ORDERING", ordering)).strip().upper()
     if ordering != "RING":
         raise InputError(
             f"{path}: ORDERING is {ordering}, expected RING; rewrite it with healpy.write_map(..., "
@@ -267,7 +288,6 @@ def _read_map(path: Path) -> np.ndarray:
             f"{path}: COORDSYS is {frame}, expected G (Galactic); rotate the map with "
             f"healpy.Rotator(coord=['{frame[:1]}', 'G'])"
         )
-    return values
 
 
 COLUMNS = ("index", "real", "imag")
@@ -420,6 +440,8 @@ def _read_alm_fits(path: Path) -> np.ndarray:
 
 
 STEPS = ("FREQ_START", "FREQ_END", "FREQ_STEP")
+# the table of frequencies in cubes of maps that the package writes
+LISTED = "FREQUENCIES"
 CUBE = Layout(
     "sky maps of many frequencies: an image (frequency, pixel)",
     {"maps": Variable(("frequency", "pixel"), unit="K")},
@@ -437,7 +459,7 @@ class SkyCube(SkyFile):
     path : str
         The file, for messages.
     frequencies_mhz : (frequencies,) array
-        Increasing in equal steps.
+        Increasing.
     pixels : (frequencies, pixels) array
         HEALPix RING, Galactic, in K.
     """
@@ -448,7 +470,10 @@ class SkyCube(SkyFile):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        return has_words(path, STEPS)
+        if not is_fits(path):
+            return False
+        with opened(path) as hdus:
+            return LISTED in hdus or all(word in hdus[0].header for word in STEPS)
 
     @classmethod
     def read(cls, path: str | Path, dataset: str | None = None) -> SkyCube:
@@ -463,17 +488,21 @@ class SkyCube(SkyFile):
         with opened(path, "sky maps of many frequencies") as hdus:
             images = {} if hdus[0].data is None else {"maps": hdus[0].data}
             header = dict(hdus[0].header)
+            mhz = hdus[LISTED].data.field(0).astype(float) if LISTED in hdus else None
+            if mhz is not None:  # in any steps
+                header |= dict(zip(STEPS, (mhz[0], mhz[-1], 1.0), strict=True))
             cube = CUBE.checked(path, images, header | {"maps.units": header.get("BUNIT")})
+        _require_ring(path, header, "RING")
         start, end, step = (cube.values[key] for key in STEPS)
         pixels = cube.arrays["maps"]
-        count = round((end - start) / step) + 1
-        if len(pixels) != count:
+        mhz = start + step * np.arange(round((end - start) / step) + 1) if mhz is None else mhz
+        if len(pixels) != len(mhz):
             raise InputError(
-                f"{path}: the image has shape {pixels.shape}, expected {count} maps for {start:g} "
-                f"to {end:g} MHz in steps of {step:g}"
+                f"{path}: the image has shape {pixels.shape}, expected {len(mhz)} maps for "
+                f"{start:g} to {end:g} MHz"
             )
         _require_healpix(path, pixels.shape[1])
-        return cls(str(path), start + step * np.arange(count), pixels)
+        return cls(str(path), mhz, pixels)
 
     def map_at(self, frequency_mhz: float) -> Float[np.ndarray, " pixels"]:
         """Return the map at a frequency; between two maps, each pixel follows a power law.
@@ -502,6 +531,8 @@ class SkyCube(SkyFile):
                 "sky.spectral_index), or a survey's frequency_mhz"
             )
         above = int(np.searchsorted(mhz, frequency_mhz))
+        if (gaps := _is_unseen(self.pixels[max(above - 1, 0) : above + 1])).any():
+            raise InputError(f"{self.path}: {gaps.sum()} pixels are UNSEEN; give full-sky maps")
         if mhz[above] == frequency_mhz:
             return self.pixels[above]
         low, high = self.pixels[above - 1], self.pixels[above]

@@ -34,7 +34,7 @@ from lusee_bayes.sky.prior import Prior
 from lusee_bayes.sky.sky_source import Sky
 
 # skies of noise alone, in K, and the noise behind them, weighted
-Volume = tuple[Float[Array, "draws modes"], Float[Array, "draws data"]]
+Volume = tuple[Float[Array, "terms modes"], Float[Array, "terms data"], float]
 # visibilities around which a term of N is built: the modelled sky's, the data, or the map's
 NoiseAbout = Literal["model", "measured", "posterior"]
 
@@ -266,9 +266,10 @@ class Around:
         About which the model is linear in its unknowns, in K; None for the scenario's.
     values : mapping of float or None
         Of the unknowns about which it is linear, by name; None for their prior means.
-    volume : ((draws, modes), (draws, data)) arrays or None
-        Skies s = C A^T w of noise alone, in K, and w = N^-1 n, to estimate the volume of skies that
-        fit. None before there is a posterior.
+    volume : ((terms, modes) array, (terms, data) array, float) or None
+        Skies s, in K, and data w for which the mean of s w^T is C A^T N^-1, whose slopes are those
+        of the volume of skies that fit; and the standard errors that this mean must exceed. None
+        before there is a posterior.
     tempered : float
         Factor of radiometer noise in first rounds; above 1, its products are independent.
     gains, gain_slope : (antennas, times) arrays or None

@@ -14,6 +14,7 @@ from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
 from lusee_bayes.core.arrays import Array, DataVector, Grid
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.section import NOT_TINY, Positive, Section, Treatment, requires
 from lusee_bayes.instrument.products import DataLayout
@@ -47,6 +48,8 @@ SCALES = ("gain_sigma", "gain_log_correlation")
 # white noise of the drifts: three samples per correlation time are exact to exp(-9 pi^2 / 2), and
 # beyond six correlation times its weight is exp(-36)
 PER_CORRELATION, MARGIN = 3.0, 6.0
+# largest number of times of that noise
+MOST_POINTS = 1e6
 # number folded into the scenario's seed for the scales
 SCALE_DRAW = 6
 # standard deviation of the ln of a scale
@@ -170,6 +173,11 @@ class GainDrifts(Systematic):
         factor = 1.0 if log_std is None else float(np.exp(CORRELATION_REACH * log_std))
         longest = GainDrift(drift.sigma, middle * max(factor, FACTOR))
         ends = middle / factor, middle * factor
+        if PER_CORRELATION * (hours[-1] - hours[0]) > MOST_POINTS * ends[0]:
+            raise InputError(
+                f"noise.gain.correlation_h is {ends[0]:.3g} h at least, too short for "
+                f"{hours[-1] - hours[0]:.4g} h of data; such gains are noise: noise.radiometer"
+            )
         grid = white_grid(hours, *ends, per_correlation=PER_CORRELATION, margin=MARGIN)
         widths, stds = (drift.width(hours), longest.width(hours)), (log_sigma_std, log_std)
         times = jnp.asarray(hours), jnp.asarray(grid)
@@ -322,8 +330,8 @@ class GainDrifts(Systematic):
         ----------
         solution : Solution
             With this term in N.
-        volume : ((draws, modes), (draws, data)) arrays
-            s = C A^T w, and w = N^-1 n.
+        volume : Volume
+            s = C A^T w, and w = N^-1 n, of draws of n.
         """
         slopes, about, total = self.slopes, self.about, 0.0
         response = with_gains(np.ones_like(slopes[0]), about)
@@ -331,7 +339,7 @@ class GainDrifts(Systematic):
         def pulled(slopes: Float[Array, "antennas products times"], data: DataVector) -> Gains:
             return (slopes * self.layout.scatter(data)).sum(1)
 
-        for sky, weights in zip(*volume, strict=True):
+        for sky, weights in zip(*volume[:2], strict=True):
             signal = np.asarray(solution.model.coupling @ sky)
             left = weights - np.asarray(solution.factor.solve(signal))
             drifts = self.drift.correlated(pulled(slopes, left), np.asarray(self.hours))

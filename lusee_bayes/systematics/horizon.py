@@ -96,6 +96,10 @@ class HorizonSection(Section):
         lambda section: section.treatment == "ignored" or section.file or section.altitude_deg,
         "give file or altitude_deg: at altitude 0, where beams vanish, data do not constrain it",
     )
+    _within_reach = requires(
+        lambda section: sum(map(abs, section.true_values.values())) <= REACH * section.std_deg,
+        f"true_values lie more than {REACH:g} std_deg from the known altitude; raise std_deg",
+    )
 
     def altitude_at(self, azimuth: Altitudes) -> Altitudes:
         """Interpolate the known altitude, all in radians.
@@ -172,6 +176,8 @@ class Horizon(ChangedBeams):
         ahead = np.radians(np.array(setup.observation.turntable_deg))[:, None]
         azimuth = np.pi / 2.0 - ahead - 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
         altitude = section.altitude_at(azimuth)
+        if section.treatment != "ignored" and not altitude.any():
+            raise InputError(f"noise.horizon.file {section.file} has altitude 0 everywhere")
         highest = min(float(altitude.max() + np.radians(REACH * section.std_deg)), np.pi / 2.0)
         # polynomials that follow the patterns, and the harmonics: lmax radians per radian
         grids = _rings(24 + int(highest * beams.lmax), highest), whole

@@ -113,10 +113,10 @@ class SourcesSection(Section):
 
     @model_validator(mode="after")
     def _names_differ(self) -> SourcesSection:
-        names = [source.name for source in self.list]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"the source '{name}' is listed twice")
+        sites = [source.name.replace(" ", "_") for source in self.list]
+        for source, site in zip(self.list, sites, strict=True):
+            if sites.count(site) > 1:
+                raise ValueError(f"the source '{source.name}' is listed twice")
         return self
 
 

@@ -562,10 +562,10 @@ class Expanded(Marginalised):
         later, expected = 1.0 if gains is None else gains, np.zeros(len(centre))
         if systematic.moves and around.volume is not None:
             still = slopes(np.zeros(model.prior.size))  # of all but the sky
-            for deviation, weighted in zip(*around.volume, strict=True):
-                pull = later * weighted / len(around.volume[0])
-                expected -= slopes(deviation).T @ pull - still.T @ pull
+            *terms, doubt = around.volume
+            slope = [(slopes(s) - still).T @ (later * w) for s, w in zip(*terms, strict=True)]
             del still
+            expected = -shrunk_mean(np.array(slope), doubt)
         columns = slopes(np.asarray(around.sky))
         shift = columns @ (expected - centre)
         columns = columns if gains is None else columns * gains[:, None]
@@ -576,6 +576,13 @@ class Expanded(Marginalised):
         noise = model.noise + LowRankCovariance(self.columns, self.systematic.words)
         at_centre = self.systematic.effect(model, self.systematic.values(self.centre))
         return with_added(replace(at_centre, noise=noise), self.shift)
+
+
+def shrunk_mean(terms: Float[np.ndarray, "terms n"], doubt: float) -> Vector:
+    """The mean over terms, less where it does not exceed ``doubt`` standard errors by far."""
+    mean = terms.mean(0)
+    error = doubt * terms.std(0, ddof=1) / np.sqrt(len(terms))
+    return mean * np.clip(1.0 - (error / np.where(mean == 0.0, np.inf, mean)) ** 2, 0.0, 1.0)
 
 
 @eqx.filter_jit

@@ -56,7 +56,7 @@ def test_the_command_writes_averages_and_says_what_they_cost(path, tmp_path, cap
     found = read_visibilities(out)
     assert found.digest() == averaged(read_visibilities(path), 7200.0).digest()
     there = refused(capsys, "average", path, "--to", "4h", "-o", out, *given)
-    assert "exists already; give another name, or --force" in there
+    assert "exists already; remove it, give another name, or --force" in there
     long, again = tmp_path / "long.nc", tmp_path / "again.nc"
     assert "days" in refused(capsys, "average", path, "--to", "1e9d", "-o", long, *given)
     assert not long.exists()

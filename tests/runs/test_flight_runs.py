@@ -106,7 +106,7 @@ def test_files_are_replaced_only_if_it_is_asked_for(simulated, tmp_path, capsys)
     ):
         out.write_bytes(b"mine")
         there = refused(capsys, *command, "-o", out)
-        assert "exists already; give another name, or --force" in there
+        assert "exists already; remove it, give another name, or --force" in there
         assert out.read_bytes() == b"mine"
         assert run(*command, "-o", out, "--force") == 0
         assert out.read_bytes() != b"mine"

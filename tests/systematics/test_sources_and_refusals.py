@@ -131,7 +131,7 @@ def test_the_table_is_in_jansky():
     # and the truth is where the posterior says, five of them to 5 sigma
     assert np.abs((table["flux_jy"] - table["true_jy"]) / table["std_jy"]).max() < 5.0
     # data without a truth have no such column
-    real = replace(experiment(), data=replace(experiment().data, truth=None))
+    real = replace(experiment(), setup=replace(experiment().setup, measured=True))
     assert "true_jy" not in flux_table(real, lb.infer(real))
 
 

@@ -107,7 +107,7 @@ def test_found_drifts_have_the_shift_of_the_volume():
     assert drifts.found is not None
     weighted = np.asarray(solution.factor.whiten_transpose(np.sqrt(n) * np.eye(n)))
     skies = solution.covariance @ np.asarray(solution.model.coupling.transpose_mv(weighted))
-    slope = drifts.volume_slope(solution, (skies.T, weighted.T))
+    slope = drifts.volume_slope(solution, (skies.T, weighted.T, 0.0))
     hours = np.asarray(drifts.hours)
     moved_by = (drifts.slopes * drifts.drift.correlated(slope, hours)[:, None]).sum(0)
     pull = solution.factor.solve(np.asarray(e.setup.layout.gather(moved_by)))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import lusee_bayes as lb
+from lusee_bayes.experiment import rounds
 from lusee_bayes.experiment.model import base_model, set_up, systematics
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.systematics.context import Around
@@ -32,7 +33,8 @@ def test_draws_estimate_the_trace():
     ((_, antennas),), model = systematics(setup), base_model(setup)
     values = {"zenith_angle_deg": 75.5, "height_m": 2.02}
     there = antennas.effect(model, values)
-    posterior = there.condition(np.asarray(there.predict(setup.sky.modes))).posterior
+    solution = there.condition(np.asarray(there.predict(setup.sky.modes)))
+    posterior = solution.posterior
     a, noise = np.asarray(there.coupling.dense()), np.asarray(model.noise.diagonal())
     root = np.linalg.cholesky(np.asarray(posterior.covariance()))
     exact, error = np.zeros(2), np.zeros(2)
@@ -44,13 +46,19 @@ def test_draws_estimate_the_trace():
         exact[k] = -np.trace(whole)
         error[k] = np.sqrt(2.0 * (((whole + whole.T) / 2.0) ** 2).sum() / N_DRAWS)
     draws = np.asarray(posterior.sample(jax.random.key(0), N_DRAWS)) - np.asarray(posterior.mean)
-    around = Around(sky=setup.sky.modes, values=values, volume=(draws, draws @ a.T / noise))
-    got = np.asarray(Expanded.at(antennas, model, around).expected)
+
+    def expected(volume):
+        around = Around(sky=setup.sky.modes, values=values, volume=volume)
+        return np.asarray(Expanded.at(antennas, model, around).expected)
+
+    got = expected((draws, draws @ a.T / noise, 0.0))
     assert (np.abs(got - exact) < 4.0 * error).all()
     assert (np.abs(exact) > 10.0 * error).any()
-    # without draws nothing is expected
-    nothing = Expanded.at(antennas, model, Around(sky=setup.sky.modes, values=values))
-    assert not np.any(nothing.expected)
+    # a small problem needs no draws; the differences have a step
+    np.testing.assert_allclose(expected(rounds._volume(solution, 2)), exact, rtol=1e-4)
+    # what is lost in the scatter of draws is not expected
+    assert not expected((draws, draws @ a.T / noise, 1e3)).any()
+    assert not expected(None).any()
 
 
 def test_evidence_is_that_with_the_volume_as_a_factor():

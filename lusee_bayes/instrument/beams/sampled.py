@@ -56,6 +56,8 @@ Sampled = Inexact[np.ndarray, "n *directions"]
 OnGrid = Inexact[np.ndarray, "n theta phi"]
 # tolerance of angles in degrees that are written with few digits, or in single precision
 ANGLE_TOLERANCE = 1e-4
+# a step of theta this many times as wide as the median is a gap
+GAP = 3.0
 
 
 @dataclass(frozen=True)
@@ -105,11 +107,12 @@ class Directions:
                 )
             return cls(None, 0, healpy.npix2nside(n_last))
         used = theta[theta < 90.0 - ANGLE_TOLERANCE]
-        step = np.diff(theta)[: len(used)].max(initial=0.0) + ANGLE_TOLERANCE
-        if len(used) < 4 or max(used[0], 90.0 - used[-1]) > step:
+        steps = np.diff(theta)[: len(used)]
+        step = min(steps.max(initial=0.0), GAP * np.median(steps)) + ANGLE_TOLERANCE
+        if len(used) < 4 or max(used[0], 90.0 - used[-1], *steps) > step:
             raise InputError(
                 f"{path}: theta_deg runs from {theta[0]:g} to {theta[-1]:g} in {len(theta)} steps, "
-                "expected at least four angles from the zenith (0) to the horizon (90)"
+                "expected at least four angles, without a gap, from the zenith to the horizon"
             )
         n = len(phi) - int(len(phi) > 1 and abs(phi[-1] - 360.0) < ANGLE_TOLERANCE)
         if np.abs(phi[:n] - 360.0 * np.arange(n) / n).max() > ANGLE_TOLERANCE:
@@ -320,7 +323,8 @@ def sampled_beams(
         raise InputError(f"{path}: give both theta_deg and phi_deg, or neither for HEALPix")
     grid = {} if theta_deg is None else {"theta_deg": theta_deg, "phi_deg": phi_deg}
     alone = np.ndim(frequencies_mhz) == 0
-    arrays = {name: np.asarray(x)[None] if alone else np.asarray(x) for name, x in fields.items()}
+    filled = {name: np.ma.filled(x, np.nan) for name, x in fields.items()}
+    arrays = {name: x[None] if alone else x for name, x in filled.items()}
     arrays |= {name: np.atleast_1d(np.asarray(x, dtype=float)) for name, x in grid.items()}
     arrays["frequency_mhz"] = np.atleast_1d(np.asarray(frequencies_mhz, dtype=float))
     require_positive(f"{path}: frequency_mhz", arrays["frequency_mhz"])
