@@ -32,7 +32,7 @@ def in_unit(name: str, value: Any, unit: str) -> Any:
     """
     if not hasattr(value, "to_value"):
         return value
-    with refusing(f"{name} is in '{value.unit}', expected {unit}", TypeError):
+    with refusing(f"{name} is in '{value.unit}', expected {unit}", TypeError, ValueError):
         return value.to_value(unit)
 
 

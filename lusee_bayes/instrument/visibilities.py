@@ -214,7 +214,7 @@ class Visibilities(checks.Described):
         cls,
         data: Any,
         times: Any,
-        frequency_mhz: float,
+        frequency_mhz: Any,
         *,
         products: Any = None,
         site: Any = "LuSEE-Night",
@@ -224,10 +224,10 @@ class Visibilities(checks.Described):
         timestamp: str = "middle",
         bounds: Any = None,
         live_s: Any = None,
-        step_s: float | None = None,
+        step_s: Any = None,
         n_antennas: int = N_ANTENNAS,
     ) -> Visibilities:
-        """Create a data set from arrays.
+        """Create a data set from arrays; numbers with a unit may be astropy Quantities of any unit.
 
         Parameters
         ----------

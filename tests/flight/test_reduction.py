@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 import pytest
 from assertions import refuse
+from astropy import units as u
 from naive_flight import FLIGHT_ORDER, naive_band
 
 from lusee_bayes.flight import reduced as rd
@@ -254,9 +255,22 @@ def test_the_turntable_turns_when_the_scenario_says(flight, table, reduced):
     start, end = seconds_from(turned, seen.times) + seen.windows.bounds_s.T
     assert (end[seen.run == 0] < 0.0).all() and (start[seen.run == 1] > 0.0).all()
     assert end[seen.run == 0].max() > -1800.0 and start[seen.run == 1].min() < 1800.0
+    # a spectrum that sees the turn is of no use
+    at = read_session(flight / "session_a.h5")
+    given = recipe(table, timestamp="start", turns={(times[3] + 60.0 * u.s).isot: 30.0})
+    one = reduce_sessions([at, *sessions(flight, "bcd")], given)
+    np.testing.assert_array_equal(one.reason[:, 2:5] == rd.NO_DATA, [[False, True, False]] * 2)
     refuse(
         "flight.turns.*noon", reduce_sessions, sessions(flight), recipe(table, turns={"noon": 3})
     )
+
+
+def test_an_auto_of_zero_takes_its_port_along(flight, table, tmp_path):
+    path = shutil.copy(flight / "session_a.h5", tmp_path)
+    with h5py.File(path, "r+") as file:
+        file["spectra/data"][3, 0] = 0
+    values = reduce_sessions([read_session(path)], recipe(table)).values[:, :, 3]
+    np.testing.assert_array_equal(np.isnan(values), [["0" in name for name in labels()]] * 2)
 
 
 def test_averages_of_files_are_those_of_the_reduction(flight, table, tmp_path):

@@ -217,6 +217,8 @@ NO_BEAMS = [
     (lambda: embedded("grid") | {"phi_deg": PHI_DEG + 1.0}, "expected 360 k / n"),
     (lambda: embedded("grid") | {"theta_deg": THETA_DEG / 2}, "to the horizon"),
     (lambda: embedded("grid") | {"theta_deg": THETA_DEG[::-1]}, "theta_deg does not increase"),
+    (lambda: embedded("grid") | {"theta_deg": np.append(THETA_DEG[:-1] / 3, 90)}, "without a gap"),
+    (lambda: {"products": np.ma.masked_less(np.zeros((16, 48)), 1.0)}, "NaN or infinity in"),
     (lambda: embedded("grid") | {"e_phi": np.zeros((3, 31, 60))}, "e_phi has shape"),
     (lambda: {"products": np.zeros((16, 50))}, "not the 12 NSIDE.2 pixels"),
     (lambda: {"products": np.zeros((5, 48))}, "5 products do not match"),

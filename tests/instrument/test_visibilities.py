@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from assertions import close, refuse, within
+from astropy import units as u
 from astropy.time import Time
 
 import lusee_bayes as lb
@@ -197,6 +198,23 @@ def test_angles_are_runs_and_sites_are_places(tmp_path):
     assert again.observation.turntable_deg == (0.0, 30.0, 0.0)
 
 
+def test_times_are_written_whatever_their_format_is(tmp_path):
+    days = Time([t.isoformat() for t in TIMES], precision=0, out_subfmt="date") + 0.4 * u.s
+    own = make(times=days)
+    assert read_visibilities(own.write(tmp_path / "own.nc")).digest() == own.digest()
+
+
+def test_quantities_have_units():
+    plain = make(turntable_deg=30.0, step_s=7200.0, live_s=600.0)
+    given = {"turntable_deg": np.pi / 6.0 * u.rad, "step_s": 2.0 * u.h, "live_s": 10.0 * u.min}
+    seen = make(1e3 * columns(PAIRS) * u.mK, frequency_mhz=25e6 * u.Hz, **given)
+    np.testing.assert_allclose(seen.data, plain.data, rtol=1e-14)
+    assert (seen.frequency_mhz, seen.observation.step_s) == (25.0, 7200.0)
+    assert seen.observation.turntable_deg == pytest.approx((30.0,), rel=1e-14)
+    np.testing.assert_allclose(seen.observation.live_s, plain.observation.live_s, rtol=1e-14)
+    refuse("frequency_mhz is in 'K', expected MHz", make, frequency_mhz=25.0 * u.K)
+
+
 WRONG = [
     ({"products": ["00", "01"]}, "shape"),
     ({"data": columns(PAIRS).T}, "transpose"),
@@ -221,6 +239,7 @@ WRONG = [
     ({"times": ["yesterday"] * N}, "is not a date"),
     ({"times": np.arange(N)}, "give datetimes"),
     ({"times": [t.replace(year=2060) for t in TIMES]}, "ephemeris"),
+    ({"times": Time(TIMES, scale="ut1")}, "times are in ut1"),
     ({"site": "Lusee-Nihgt"}, "did you mean 'LuSEE-Night'"),
     ({"site": 3.0}, "longitude and latitude"),
     ({"site": (0.0, 95.0)}, "lat_deg"),

@@ -110,6 +110,18 @@ def test_products_without_weight_take_no_part(blocks):
     close(summed(coupling, weights if blocks else np.einsum("kkt->kt", weights)), expected, 1e-12)
 
 
+def test_nearly_singular_blocks_lose_no_digits():
+    """Eigenvalues of 1 to 1e-9: with inverses, 1 + A^T N^-1 A would not be positive."""
+    coupling = on_host(setting(missing=False))
+    q = np.linalg.qr(np.random.default_rng(2).normal(size=(N_PRODUCTS, N_PRODUCTS)))[0]
+    block = (q * np.logspace(0, -9, N_PRODUCTS)) @ q.T
+    blocks = np.tile((block + block.T) / 2.0, (coupling.layout.n_times, 1, 1))
+    noise = time_blocks.TimeBlockCovariance(blocks, coupling.layout)
+    white = np.asarray(noise.factor().whiten(coupling.dense()))
+    got = np.linalg.eigvalsh(normal_matrix(coupling, noise))
+    np.testing.assert_allclose(got, np.linalg.svd(white)[1][::-1] ** 2, rtol=1e-6)
+
+
 def test_without_structure():
     coupling = setting()
     diagonal = noise_of("diagonal", coupling.layout)

@@ -185,6 +185,9 @@ def test_draws_scatter_as_the_covariance_says_and_are_positive(case):
     width = np.sqrt(np.diagonal(sky.covariance))
     # standard deviations of 3000 draws scatter by 1.3 %, the exponential adds some percent
     np.testing.assert_allclose(sky.draws.std(0) / width, 1.0, atol=0.15)
+    # not in what the data know best
+    white = np.linalg.solve(np.linalg.cholesky(sky.covariance), (sky.draws - sky.mean).T)
+    assert (white**2).mean() == pytest.approx(1.0, abs=0.15)
     assert (skies.values(0, mode.exponents[0, :N]) > 0).all()
 
 

@@ -15,6 +15,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, synthesis_matrix, to_healpy
 from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.report.describe import describe
+from lusee_bayes.results.finished_runs import write_cubes
 from lusee_bayes.sky import sky_source as ss
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.testing import assert_refused, check_sky_source
@@ -198,6 +199,33 @@ def test_millikelvin_are_converted_and_lmax_has_to_fit(tmp_path, pixels):
     write_fits(path, pixels, "mK")
     np.testing.assert_allclose(ss.read_sky_file(path).pixels, pixels / 1e3, rtol=1e-14)
     refuse("lmax = 48.*NSIDE 16", lb.sky_from_file, path, 10.0, 48)
+
+
+def test_pixels_without_data(tmp_path, pixels, maps):
+    gap, path = np.arange(pixels.size) < 10, tmp_path / "map.fits"
+    for unit, partial in (("mK", False), ("K", True)):  # all pixels, or a list of those with data
+        form = {"column_units": unit, "partial": partial, "overwrite": True, "dtype": np.float64}
+        healpy.write_map(path, np.where(gap, healpy.UNSEEN, pixels), coord="G", **form)
+        read = ss.read_sky_file(path)
+        np.testing.assert_array_equal(read.unseen, gap)
+        factor = 1e-3 if unit == "mK" else 1.0
+        np.testing.assert_allclose(read.pixels[~gap], factor * pixels[~gap], rtol=1e-14)
+        refuse("10 of.*UNSEEN", lb.sky_from_file, path, 25.0, 4)
+    maps[9, 3] = healpy.UNSEEN
+    cube = ss.SkyCube.read(path := write_cube(tmp_path / "cube.fits", maps))
+    for mhz in (9.5, 10.0, 10.5):
+        refuse("UNSEEN", cube.map_at, mhz)
+    fits.setval(path, "ORDERING", value="NESTED")
+    refuse("ORDERING is NESTED", ss.SkyCube.read, path)
+
+
+def test_cubes_of_runs_have_any_frequencies(tmp_path, maps):
+    mhz, scenario = np.array([1.0, 2.0, 5.0]), lb.load_scenario("fiducial")
+    write_cubes(tmp_path, {"mean": maps[[0, 1, 4]]}, mhz, scenario)
+    cube = ss.read_sky_file(tmp_path / "mean.fits")
+    np.testing.assert_array_equal(cube.frequencies_mhz, mhz)
+    index = np.where(np.arange(maps.shape[1]) % 2, -2.5, -2.1)
+    np.testing.assert_allclose(cube.map_at(3.0), maps[0] * 3.0**index, rtol=1e-13)
 
 
 CUBE_NSIDE = 8

@@ -172,7 +172,7 @@ def test_other_beams_are_behind_the_terrain_too():
 
 def test_what_cannot_be(tmp_path):
     def tabled(*rows):
-        setup_of(f"file: {written(tmp_path, rows)}, std_deg: 1")
+        return setup_of(f"file: {written(tmp_path, rows)}, std_deg: 1")
 
     refuse("one row.*two or more", tabled, (0, 1))
     refuse("altitude_deg.*outside 0 to 45", tabled, (0, 1), (90, 46))
@@ -181,5 +181,7 @@ def test_what_cannot_be(tmp_path):
     refuse("has no azimuth_deg", setup_of, f"file: {tmp_path / 'other.csv'}, std_deg: 1")
     refuse("no table of the horizon", setup_of, "file: none.csv, std_deg: 1")
     refuse("give file or altitude_deg: at", setup_of, "std_deg: 1")
+    refuse("6 std_deg", setup_of, "std_deg: 1, altitude_deg: 1, true_values: {horizon_deg: 7}")
+    refuse("altitude 0 everywhere", lambda: models.systematics(tabled((0, 0), (90, 0))))
     wrong = setup_of("std_deg: 1, altitude_deg: 1, true_values: {horizon_cos_9_deg: 1}")
     refuse("'horizon_cos_9_deg'.*no prior", models.true_values, wrong)
