@@ -153,8 +153,7 @@ def pulls(truth: Setup, found: Inference) -> dict[str, float]:
     values, off = true_values(truth), {}
     for part in found.expanded:
         own, told = part.systematic, found.amplitudes(part)
-        true = own.true(values)
-        z = (np.array([true[name] for name in own.names]) - own.means) / own.stds
+        z = (np.array([own.true(values)[name] for name in own.names]) - own.means) / own.stds
         away = (np.asarray(part.expected) + told.mean - z) / told.std
         off |= dict(zip(own.names, away.tolist(), strict=True))
     return off

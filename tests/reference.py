@@ -103,8 +103,7 @@ def layered_reflection(permittivities, thickness_m, cos_theta, frequency_mhz):
     ``thickness_m`` thick. s is the ratio of the reflected to the incident tangential E, p that of
     the tangential H.
     """
-    k = 2.0e6 * np.pi * frequency_mhz / SPEED_OF_LIGHT
-    ratios = []
+    k, ratios = 2.0e6 * np.pi * frequency_mhz / SPEED_OF_LIGHT, []
     for polarisation in "sp":
 
         def admittance(eps, polarisation=polarisation):
@@ -142,8 +141,7 @@ def arm_response(
     # H of the theta wave is horizontal and scales by p; E = H x (direction of travel)
     reflected_theta = -r_p * e_theta * np.array([1.0, 1.0, -1.0])
     reflected_phi = r_s * e_phi
-    detour = np.exp(-2j * k * height * n[2])
-    answers = []
+    detour, answers = np.exp(-2j * k * height * n[2]), []
     for direct, reflected in ((e_theta, reflected_theta), (e_phi, reflected_phi)):
         wave = (arm @ direct) * np.exp(1j * k * s * (arm @ n))
         echo = (arm @ reflected) * np.exp(1j * k * s * (arm @ mirrored)) * detour

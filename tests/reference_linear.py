@@ -122,8 +122,7 @@ def assert_draws_follow(draws, mean, covariance):
     mean by sqrt((C_ii C_jj + C_ij^2) / n).
     """
     draws, covariance = np.asarray(draws), np.asarray(covariance)
-    n = len(draws)
-    delta = draws - np.asarray(mean)
+    n, delta = len(draws), draws - np.asarray(mean)
     variance = np.diag(covariance)
     worst = np.abs(delta.mean(0)) / np.sqrt(variance / n)
     assert worst.max() < z_of(worst.size), f"sample mean off by {worst.max():.2f} sigma"

@@ -56,8 +56,7 @@ def test_there_is_one_version():
 
 def test_advice_names_no_package_of_an_index():
     files = [*PACKAGE.rglob("*.py"), *(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
-    named = [p for p in files if "install 'lusee_bayes[" in p.read_text(encoding="utf-8")]
-    assert not named
+    assert not [p for p in files if "install 'lusee_bayes[" in p.read_text(encoding="utf-8")]
 
 
 def test_every_text_names_its_encoding():

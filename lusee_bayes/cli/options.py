@@ -43,10 +43,7 @@ def parse_duration(text: str) -> float:
     match = DURATION.fullmatch(text)
     seconds = float(match[1]) * SECONDS[match[2]] if match else 0.0
     if not 0.0 < seconds < inf:
-        raise InputError(
-            f"'{text[:40]}' is not a duration; give a positive number with its unit (s, min, h or "
-            "d), such as 30s, 10min, 2h or 1d"
-        )
+        raise InputError(f"'{text[:40]}' is not a duration; give one such as 30s, 10min, 2h or 1d")
     return seconds
 
 

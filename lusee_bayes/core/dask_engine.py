@@ -208,8 +208,7 @@ def refusal_of(
     if demand is not None and limit and demand.process_bytes(n) > limit:
         return (
             f"it is limited to {gigabytes(limit)} of memory, but {n} task(s) at a time need about "
-            f"{gigabytes(demand.process_bytes(n))}; start it with a larger --memory-limit or fewer "
-            "--nthreads"
+            f"{gigabytes(demand.process_bytes(n))}; raise its --memory-limit, or lower --nthreads"
         )
     advice = "command and workers must share a disk: give a folder on it with -o"
     return None if folder.is_dir() else f"it does not see '{folder}'; {advice}"

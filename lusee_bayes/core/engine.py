@@ -293,8 +293,7 @@ def open_engine(
         return
     if find_spec("distributed") is None:
         raise InputError(
-            "--workers and --cluster need Dask; install it with pip install '.[cluster]' in the "
-            "clone of lusee_bayes"
+            "--workers and --cluster need Dask: pip install '.[cluster]' in lusee_bayes's clone"
         )
     # an optional library, whose import takes a second
     from lusee_bayes.core.dask_engine import connected, own_workers

@@ -324,8 +324,7 @@ def require_apart(folder: Path, inputs: Iterable[str | Path]) -> None:
     for path in inputs:
         if user_path(path).resolve() in written:
             raise InputError(
-                f"'{path}' is an input of this run, which would replace it; give another place "
-                "for the results with -o"
+                f"'{path}' is an input of this run, which would replace it; give another -o"
             )
 
 

@@ -378,8 +378,7 @@ def turn_about_z(modes: Fields, angle: float | Float[Array, ""]) -> Fields:
     """
     ell, m = mode_numbers(round(np.sqrt(modes.shape[-1])) - 1)
     mirrored = modes[..., ell * (ell + 1) - m]
-    xp = namespace(modes, angle)
-    angles = m.astype(np.float64) * angle
+    xp, angles = namespace(modes, angle), m.astype(np.float64) * angle
     shape = (1,) * (modes.ndim - 1) + (-1,)
     return modes * xp.cos(angles).reshape(shape) + mirrored * xp.sin(angles).reshape(shape)
 
@@ -406,8 +405,7 @@ def _horizontal_generators(lmax: int) -> tuple[np.ndarray, np.ndarray]:
     for ell in range(lmax + 1):
         for axis, k in enumerate(generators(ell)[:2]):
             order = np.argsort(-np.abs(k), axis=1, kind="stable")[:, :2]
-            rows = slice(ell**2, (ell + 1) ** 2)
-            width = order.shape[1]
+            rows, width = slice(ell**2, (ell + 1) ** 2), order.shape[1]
             columns[axis, rows, :width] = ell**2 + order
             weights[axis, rows, :width] = np.take_along_axis(k, order, axis=1)
     return columns, weights

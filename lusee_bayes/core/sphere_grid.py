@@ -56,8 +56,7 @@ class SphereGrid(eqx.Module):
         """
         if band < lmax:
             raise InputError(
-                f"a grid of band limit {band} does not support harmonics up to ell = {lmax}; give "
-                "a band limit of at least lmax"
+                f"a grid of band limit {band} does not support harmonics up to ell = {lmax}"
             )
         x, weights = np.polynomial.legendre.leggauss(band + 1)
         theta, n_phi = np.arccos(x), 2 * band + 2

@@ -256,8 +256,7 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     source = section.source().behind(waterfall.receiver)
     if (circuit := source.circuit(frequency)) is None:
         raise InputError(
-            f"{waterfall.path} is in V^2/Hz, at the receivers' inputs of a four-port instrument; "
-            "give its response as beam.file"
+            f"{waterfall.path} is in V^2/Hz, at receivers' inputs; give the response as beam.file"
         )
     rule, said = source.interpolated(frequency), waterfall.interpolation
     if rule is not None and said is not None and said != INTERPOLATIONS[rule]:
@@ -311,8 +310,7 @@ def reduce_files(
         If the scenario does not supply what the files lack, a file is listed twice or already
         reduced, or as in :func:`.read_session` and :func:`.reduce_sessions`.
     """
-    stages = stages or Stages()
-    paths = [user_path(path) for path in paths]
+    stages, paths = stages or Stages(), [user_path(path) for path in paths]
     resolved = [path.resolve() for path in paths]
     for k, path in enumerate(resolved):
         if path in resolved[:k]:
@@ -387,8 +385,7 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
     source = scenario.beam.source()
     if source.n_ports != PORTS:
         raise InputError(
-            f"sessions have the products of {PORTS} ports, the beams {source.n_ports}; give beams "
-            "of all ports"
+            f"sessions have products of {PORTS} ports, the beams {source.n_ports}; give all beams"
         )
     circuit = source.circuit(scenario.frequency_mhz)
     if circuit is None and said is None:
@@ -399,8 +396,7 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
         )
     if circuit is not None and said is not None:
         raise InputError(
-            "flight.per_kelvin_v2_hz is for beams without impedances, but these have them; remove "
-            "it"
+            "flight.per_kelvin_v2_hz is for beams without impedances, which these have; remove it"
         )
     if circuit is None:
         return np.full(source.n_ports, float(said))

@@ -522,10 +522,11 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     ]
     excess = EXPLAINED * abs(base.chi2 - base.degrees)
     nearly = [one for one in proposals if one.excess < excess and not one.chi2.too_small]
-    others = list(_correlated_noise(judge))
+    others = list(_noise_of(judge, "exact"))
     suffice = [one for one in (*proposals, *others) if one.suffices(base)]
     # these always absorb part of any misfit, and count only if they absorb all of it
-    for absorbing in (_finer(judge), _noise_level(residuals, data)):
+    absorbing_ways = _finer(judge), _noise_level(residuals, data), _noise_of(judge, "paper")
+    for absorbing in absorbing_ways:
         if not suffice:
             others += (last := list(absorbing))
             suffice = [one for one in last if one.suffices(base)]
@@ -533,15 +534,16 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + len(others))
 
 
-def _correlated_noise(judge: UnderAnySky) -> Iterator[Proposal]:
-    """Correlate the products in the noise, as a radiometer does, if the model does not."""
+def _noise_of(judge: UnderAnySky, form: str) -> Iterator[Proposal]:
+    """Correlate the products in the noise as a radiometer does (exact), or as the paper, not."""
     scenario = judge.setup.scenario
-    if scenario.noise.radiometer.form == "paper":
-        scenario = load_scenario(scenario, ["noise.radiometer.form=exact"])
+    if scenario.noise.radiometer.form != form:
+        scenario = load_scenario(scenario, [f"noise.radiometer.form={form}"])
         model = full_model(replace(judge.setup, scenario=scenario), Around(judge.data))
         chi2 = replace(judge, model=model).wide(model.coupling)[0]
-        remedy = "use --set noise.radiometer.form=exact"
-        yield Proposal("the products are correlated in the noise", remedy, chi2)
+        how = {"exact": "correlated", "paper": "independent, as in some simulations"}[form]
+        words = f"the noise of the products is {how}"
+        yield Proposal(words, f"use --set noise.radiometer.form={form}", chi2)
 
 
 def _merged(proposals: list[Proposal]) -> Iterator[Proposal]:

@@ -144,8 +144,7 @@ def observed(
             n_data, top = data.layout.size, above.top(scenario.lmax)
             if n_data * n_modes(top) > MOST_ABOVE:
                 raise InputError(
-                    f"with {n_data:,} data, the sky up to lmax = {top} takes too much memory; "
-                    "average the data, or raise lmax"
+                    f"{n_data:,} data up to lmax = {top} need too much memory; average the data"
                 )
         setup = set_up(scenario, data, stages)
     except InputError as error:
@@ -158,10 +157,7 @@ def observed(
     doubts += require_plausible(data, setup.signal, std)
     gains_known = data.calibration is not None and data.calibration.gain_names
     if gains_known and scenario.noise.gain_table is None:
-        doubts.append(
-            "The stated errors of the gains (flight.gain_std, or the gain table's) are not part of "
-            "N: give noise.gain_table={}."
-        )
+        doubts.append("The stated errors of the gains are not part of N: give noise.gain_table={}.")
     for doubt in doubts:
         stages.say(f"  doubtful: {doubt}")
     return Experiment(setup, data, tuple(doubts))
@@ -258,8 +254,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     def require_free(cls: type[Systematic]) -> None:
         if cls.treatment(experiment.scenario) == "marginalised":
             raise InputError(
-                "the program samples an unknown that the scenario marginalises, too; set "
-                f"{cls.key}.treatment=sampled"
+                f"what it samples the scenario marginalises, too; set {cls.key}.treatment=sampled"
             )
 
     def built(cls: type[Systematic]) -> Systematic:
@@ -271,10 +266,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     def instrument() -> Instrument:
         require_free(BeamErrors)
         if not setup.beam_source.parameters():
-            raise InputError(
-                "the program needs the embedded antennas, which beam.file replaces; remove "
-                "beam.file"
-            )
+            raise InputError("the program needs the embedded antennas; remove beam.file")
         return setup.instrument
 
     @cache

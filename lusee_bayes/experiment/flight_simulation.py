@@ -121,8 +121,7 @@ class FlightSimulation:
             One of :attr:`sessions`.
         """
         level = self.disturbances.level[session]
-        saturated = self.disturbances.saturated[session, None]
-        n = len(level)
+        saturated, n = self.disturbances.saturated[session, None], len(level)
         rms = np.vectorize(ADC_RMS.__getitem__, otypes=[np.float64])(level)
         peak = np.rint(ADC_PEAK * rms).astype(np.int64)
         times = self.observation.times[session]
@@ -224,8 +223,7 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     radiometer, step_s = scenario.noise.radiometer, scenario.observation.step_s
     if radiometer.duty_cycle != 1.0 or radiometer.log_factor_std is not None:
         raise InputError(
-            "the noise of spectra follows from their frames; remove duty_cycle and log_factor_std "
-            "of noise.radiometer"
+            "noise follows from frames; remove duty_cycle and log_factor_std of noise.radiometer"
         )
     if flight.filter_taps:
         raise InputError(
@@ -334,7 +332,6 @@ def _drawn_gains(scenario: Scenario, flight: FlightSection) -> tuple[GainModel, 
         )
     if flight.gain_std is None and table.component_std is None:
         raise InputError(
-            "noise.gain_table needs the errors of the gains; give flight.gain_std, or "
-            "flight.component_std"
+            "noise.gain_table needs errors of the gains: flight.gain_std or flight.component_std"
         )
     return table, *draw_gains(table, flight.gain_std, np.random.default_rng([scenario.seed, 3]))

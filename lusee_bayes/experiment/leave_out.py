@@ -166,13 +166,9 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
 
 
 MAX_ROUNDS = 10
-NOT_JUDGED = (
-    "Times were not compared with each other for lack of memory; use a longer "
-    "observation.average_s."
-)
+NOT_JUDGED = "Times were not compared, for lack of memory; use a longer observation.average_s."
 TOO_MANY = (
-    "More than 20 % of the data are inconsistent with the rest; none was flagged: check noise, "
-    "gains and beams."
+    "More than 20 % of the data contradict the rest; none is flagged: check noise, gains, beams."
 )
 KEPT = (
     "Product {port}{port}R is inconsistent with the rest but was kept, because the noise of port "

@@ -174,8 +174,7 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
 
 def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     """Radiometer term of N in K^2, from the visibilities of :func:`.radiometer_about`."""
-    section = setup.scenario.noise.radiometer
-    around = around or Around()
+    section, around = setup.scenario.noise.radiometer, around or Around()
     visibilities = noise_visibilities(setup, around, radiometer_about(setup))
     given = {"bandwidth_hz": 1.0, "step_s": setup.n_averaged, "factor": section.factor}
     if around.tempered == 1.0:

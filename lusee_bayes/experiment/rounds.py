@@ -237,8 +237,7 @@ def settled(
     InputError
         If N is not positive definite.
     """
-    report = report or (lambda rounds, remark: None)
-    ways = OTHER_WAYS
+    report, ways = report or (lambda rounds, remark: None), OTHER_WAYS
     if start.sky is None:
         if (few := _fewer(setup, start)) is not None:
             inference, step = _nearby(few[0], _beginning(*few), report, ways)

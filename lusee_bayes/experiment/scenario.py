@@ -232,8 +232,7 @@ class Scenario(Section):
             self.spectral.require_channels(len(many))
         if self.sky.sources and own_sources:
             raise ValueError(
-                "the embedded sky already contains the catalogue's sources; set sky.sources=false "
-                "to use your own sources.list"
+                "the embedded sky has sources; for your own sources.list set sky.sources=false"
             )
         if error is not None and error.parameters and not self.beam.has_parameters:
             raise ValueError(
@@ -313,17 +312,13 @@ class Scenario(Section):
         """Raise InputError if anything is sampled, for commands that can only marginalise."""
         if self.samples:
             raise InputError(
-                f"in this scenario something is to be sampled, but {what} can only "
-                f"marginalise; {advice}"
+                f"something is to be sampled, but {what} can only marginalise; {advice}"
             )
 
     def require_single(self, what: str) -> None:
         """Raise InputError for several frequencies, for commands with one."""
         if not self.single:
-            raise InputError(
-                f"{what} one frequency; give a scenario with frequency_mhz and without "
-                "frequencies_mhz"
-            )
+            raise InputError(f"{what} one frequency; give frequency_mhz instead of frequencies_mhz")
 
     @property
     def map_nside(self) -> int:
@@ -382,8 +377,7 @@ def _read_yaml(source: str | Path) -> dict[Any, Any]:
         tree = parse_yaml(scenario_text(str(source)), str(source))
     elif os.sep in str(source) or Path(source).suffix[1:2].isalpha():
         raise InputError(
-            f"no scenario file at '{source}'; check the path, or give the name of a scenario of "
-            "the package"
+            f"no scenario file at '{source}'; check the path, or name one of the package"
         )
     else:
         raise InputError(

@@ -141,8 +141,7 @@ class SurveySection(Section):
                 gaps = gaps | mask.unseen | (mask.pixels == 0.0)
             if gaps.all() or not sky.pixels[~gaps].mean() > 0.0:
                 raise InputError(
-                    f"{self.file}: the mean of its pixels must be positive, and not all of them "
-                    "masked or UNSEEN"
+                    f"{self.file}: the pixels' mean must be positive, and not all of them masked"
                 )
             if gaps.any():
                 template = sky_source.galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes

@@ -245,8 +245,7 @@ def line_flags(
     """
     # level of the spectrum: a median, which a strong line does not raise; absent ports are zero
     usable = np.where((good | ~good.any(axis=1)[:, None])[:, None], autos, np.nan)
-    level = np.nanmedian(usable, axis=2)
-    root = np.sqrt(np.diagonal(band.shared))
+    level, root = np.nanmedian(usable, axis=2), np.sqrt(np.diagonal(band.shared))
     noise = np.abs(level)[..., None] * root / np.sqrt(frames)[:, None, None]
     return outliers(autos, np.where(noise > 0.0, noise, 1.0), good, band.finer, limit)
 

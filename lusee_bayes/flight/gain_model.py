@@ -127,8 +127,7 @@ class GainModel(Described):
             return self
         if self.component_std is not None:
             raise InputError(
-                f"{self.path} already contains the errors of its components; remove "
-                "flight.component_std"
+                f"{self.path} contains the errors of its components; remove flight.component_std"
             )
         return replace(self, component_std=np.broadcast_to(std, self.components.shape[:3]).copy())
 

@@ -177,7 +177,6 @@ def _interpolated_to(where: str, raw_s: Rows, times_s: Times, values: Times) -> 
     slack = 2.0 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     if not len(times_s) or raw_s[0] < times_s[0] - slack or raw_s[-1] > times_s[-1] + slack:
         raise InputError(
-            f"{where} does not cover the spectra, so that their gain is unknown; ingest the "
-            "session with its telemetry"
+            f"{where} does not cover the spectra; ingest the session with its telemetry"
         )
     return np.interp(raw_s, times_s, values)

@@ -322,8 +322,7 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     changes = np.append(True, (states[1:] != states[:-1]).any(axis=1))
     state = np.cumsum(changes) - 1
     with naming(", ".join(str(s.path) for s in ordered)):
-        angles = tuple(angle[changes].tolist())
-        longest = float(window.max())
+        angles, longest = tuple(angle[changes].tolist()), float(window.max())
         observation = Observation(lon, lat, times, state, angles, longest, windows=windows)
     bin_of = np.arange(len(state))
     if recipe.average_s is not None:

@@ -286,8 +286,7 @@ def _finish(
     shown, sigma = np.where(finite, autos, 0.0), np.where(finite & (noise.T > 0.0), noise.T, np.inf)
     burst, scatter = flags.burst_flags(seconds, shown, sigma, reason == reduced.USED, false_alarm)
     reason = np.where(burst, np.uint8(reduced.BURST), reason)
-    good = reason == reduced.USED
-    bin_of = bin_of - bin_of[0]
+    good, bin_of = reason == reduced.USED, bin_of - bin_of[0]
     n = int(bin_of[-1]) + 1
     kept, used = by_the_rule(np.isfinite(all_values) & good, bin_of, live)
     # weights are live times, both for the unflagged spectra and for all

@@ -335,8 +335,7 @@ def session_of(path: Path, parsed: Content, arrays: Mapping[str, Unread], **othe
     """
     if not parsed.values["spectra/data.bitslice_restored"]:
         raise InputError(
-            f"{path}: the bit slices of spectra/data are not restored; ingest the session again "
-            "with luseepy"
+            f"{path}: bit slices of spectra/data are not restored; ingest it again with luseepy"
         )
     rows, cube = parsed.arrays, arrays["spectra/data"]
     n = parsed.sizes["row"]
@@ -374,8 +373,7 @@ def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> PortLevels:
     """Gain levels, from the flight software's numbers or from letters."""
     if (name := f"{META}/actual_gain") not in arrays:
         raise InputError(
-            f"{path} has no {name}, the gain of every spectrum; ingest the session again with the "
-            "current luseepy"
+            f"{path} has no {name}, the gain of every spectrum; ingest it with the current luseepy"
         )
     codes = np.asarray(arrays[name])
     if codes.dtype.kind == "S" and codes.shape == (n,):

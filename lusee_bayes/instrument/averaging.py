@@ -208,8 +208,7 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     kept, used = by_the_rule(np.asarray(data.layout.present), bin_of, live_s)
     if not used.any():
         raise InputError(
-            f"averaging over {to_s:g} s leaves no data: products have no samples in common; give a "
-            "shorter time"
+            f"averages over {to_s:g} s leave no data: products share no samples; average less"
         )
     # renumber the bins that are not empty
     bins, bin_of_left = np.unique(bin_of[used], return_inverse=True)
@@ -314,8 +313,7 @@ def binned(observation: Observation, keep: TimeFlags, bin_of: Samples, to_s: flo
     bins, bin_of = np.unique(bin_of[keep], return_inverse=True)
     first = np.searchsorted(bin_of, np.arange(len(bins)))
     kept = observation.select(keep)
-    windows = kept.windows
-    seconds = seconds_from(kept.times[0], kept.times)
+    windows, seconds = kept.windows, seconds_from(kept.times[0], kept.times)
     offset = seconds[windows.sample]
     start, end = windows.start_s + offset, windows.end_s + offset
     bin_of_piece, share = bin_of[windows.sample], windows.live_s / (end - start)

@@ -469,8 +469,7 @@ class CouplingMatrix(Coupling):
         n_products, n_functions = self.body_beams.shape[1:3]
         pairs = _pairs(self.pointing.pole_from_galactic(sky), self.lmax)
         plus, minus = pairs[: self.lmax + 1], pairs[self.lmax + 1 :]
-        xp = namespace(self, sky)
-        zero_order = np.arange(self.lmax + 1)[None] == 0
+        xp, zero_order = namespace(self, sky), np.arange(self.lmax + 1)[None] == 0
         crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
         both, grids = xp.stack([pairs.T, crossed.T], axis=-1), []
         for run, part in self._parts():

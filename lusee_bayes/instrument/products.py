@@ -97,8 +97,7 @@ def to_real(matrix: Hermitian) -> Products:
 def to_matrix(products: Products) -> Hermitian:
     """Return the Hermitian matrix V_ij of real products; inverse of :func:`to_real`."""
     xp, n = namespace(products), antennas_of(products.shape[0])
-    at = {label: products[k] for k, label in enumerate(labels(n))}
-    rows = []
+    at, rows = {label: products[k] for k, label in enumerate(labels(n))}, []
     for i, j in np.ndindex(n, n):
         pair = f"{min(i, j)}{max(i, j)}"
         imag = xp.zeros_like(at[f"{pair}R"]) if i == j else at[f"{pair}I"]
@@ -220,8 +219,7 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
         i, j, part = int(match[1]), int(match[2]), match[3].upper()
         if max(i, j) >= n_antennas:
             raise InputError(
-                f"the product '{name}' has port {max(i, j)}, expected 0 to {n_antennas - 1}; give "
-                "n_antennas for more ports"
+                f"the product '{name}' has port {max(i, j)}, beyond n_antennas = {n_antennas}"
             )
         if is_complex and part:
             raise InputError(f"the data are complex; replace '{name}' by its ports, '{i}{j}'")

@@ -278,8 +278,7 @@ def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
     for (_, before, _), (place, after, _) in pairwise(entries):
         if not after > before:
             raise InputError(
-                f"{place}: start {after} is not later than the previous one, {before}; sort the "
-                "entries by their start"
+                f"{place}: start {after} is not later than the previous one, {before}; sort them"
             )
     if entries and entries[-1][2] == OBSERVING:
         raise InputError(

@@ -155,8 +155,7 @@ def _as_text(number: int, one: Any) -> str:
         one = (one.astimezone(UTC).replace(tzinfo=None) if one.tzinfo else one).isoformat()
     if not isinstance(one, str):
         raise InputError(
-            f"time {number} is {one!r}, of type {type(one).__name__}; give datetimes, ISO dates in "
-            "UTC, or an astropy Time"
+            f"time {number} is {one!r}, a {type(one).__name__}; give datetimes or an astropy Time"
         )
     # astropy does not accept ISO's Z for UTC
     return one.removesuffix("Z")
@@ -218,8 +217,7 @@ class Windows(Described):
         require_shape("sample of the windows", self.sample, (None,))
         if not counts_up(self.sample):
             raise InputError(
-                "pieces of windows must count the samples 0, 1, ... without going back, with at "
-                "least one piece for each"
+                "pieces of windows must count the samples 0, 1, ..., at least one piece for each"
             )
         for name in ("start_s", "end_s", "live_s"):
             require_shape(f"{name} of the windows", getattr(self, name), self.sample.shape)
@@ -446,8 +444,7 @@ def _bounded(times: Time, bounds: Time, step_s: float | None) -> tuple[Times, Ti
         first = int(np.argmax(outside))
         raise InputError(
             f"the time of sample {first} ({times[first].isot[:19]}) is not within its bounds, "
-            f"which begin {start[first]:g} s and end {end[first]:g} s from it; sort the bounds "
-            "like the times"
+            f"which begin {start[first]:g} s and end {end[first]:g} s from it; sort both alike"
         )
     if step_s is None:
         step = max(step, float(length.max()))

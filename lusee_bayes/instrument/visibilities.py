@@ -92,8 +92,7 @@ def read_windows(content: Content, times: Time) -> tuple[Time, Windows | None]:
     lost = [name for name in PIECES if name not in arrays]
     if said == "instant" and given:
         raise InputError(
-            f"the attribute window declares the samples instants, but {given[0]} gives windows; "
-            "remove one of them"
+            f"the attribute window declares instants, but {given[0]} gives windows; remove one"
         )
     if 0 < len(lost) < len(PIECES):
         raise InputError(f"{given[0]} without {lost[0]}; pieces of windows need both")

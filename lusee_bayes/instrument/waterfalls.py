@@ -397,8 +397,7 @@ def write_waterfall(
     seconds = times.seconds_from(first.times[0], first.times)
     if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > times.ROUNDING_S:
         raise InputError(
-            f"{path}: luseepy's waterfalls need a sample every {first.step_s:g} s without gaps; "
-            f"{HINT}"
+            f"{path}: luseepy's waterfalls need samples every {first.step_s:g} s; {HINT}"
         )
     pairs = np.array([(p.i, p.j) for p in products.all_products() if p.part == "R"])
     z = np.full(len(channels), np.nan + 1j * np.nan) if impedance_ohm is None else impedance_ohm

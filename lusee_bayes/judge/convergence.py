@@ -49,7 +49,6 @@ def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: in
     if divergences:
         warnings.append(
             f"{divergences} trajectories diverged: the steps are too long where the posterior is "
-            "narrow. Raise --warmup; if that does not help, reparametrise the program so that its "
-            "posterior is nowhere narrow."
+            "narrow. Raise --warmup, or reparametrise the program so that it is nowhere narrow."
         )
     return warnings

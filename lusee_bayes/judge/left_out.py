@@ -348,8 +348,7 @@ class LeftOut:
             lower[n:, n:] = linalg.lower_triangle(posterior.lower)
         if not np.isfinite(np.diagonal(lower)).all():
             raise InputError(
-                "the data are too precise to compare a part of them with its prediction from the "
-                "others; use fewer data at once"
+                "the data are too precise to predict a part of them from others; use fewer at once"
             )
         return lower
 

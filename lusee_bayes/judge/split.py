@@ -128,8 +128,7 @@ def widened(
     root = cholesky(precision, overwrite=True)
     if not np.isfinite(np.diagonal(root)).all():
         raise InputError(
-            "the data are too precise for the normal equations to separate noise from sky; use "
-            "fewer data at once"
+            "data are too precise for normal equations to tell noise from sky; use fewer at once"
         )
     half = solve_lower(root, inside[:, None], transpose=False)
     step = (factor**2 - 1.0) * solve_lower(root, half, transpose=True)[:, 0]

@@ -232,8 +232,7 @@ class AmplitudesOfSky:
         one, beyond = np.eye(len(off)), vector - expected
         mixed = one + precision @ inner
         gradient = np.linalg.solve(mixed, vector - precision @ off)
-        weight = np.linalg.solve(mixed, precision)
-        least = off + inner @ gradient
+        weight, least = np.linalg.solve(mixed, precision), off + inner @ gradient
         misfit = gradient @ inner @ gradient + least @ (precision @ least - 2.0 * vector)
         misfit += beyond @ np.linalg.solve(one + precision, beyond) - expected @ expected
         log_det = np.linalg.slogdet(mixed)[1] - np.linalg.slogdet(one + precision)[1]
@@ -486,12 +485,10 @@ def tie(
     n_channels, n = mean.shape
     if not (np.linalg.eigvalsh(covariance) > 0).all():
         raise InputError(
-            "a channel's data determine the shared unknowns to below rounding; map the channels "
-            "one by one"
+            "a channel's data determine shared unknowns to below rounding; map channels one by one"
         )
     blocks = root_of_kernels(kernels)
-    root = blocks.reshape(n_channels * n, -1)
-    inverse = np.linalg.inv(covariance)
+    root, inverse = blocks.reshape(n_channels * n, -1), np.linalg.inv(covariance)
     pulled = np.einsum("kij,kjw->kiw", inverse - np.eye(n), blocks)
     lower = np.linalg.cholesky(np.eye(root.shape[1]) + root.T @ pulled.reshape(root.shape))
     white, z = np.zeros(root.shape[1]), np.zeros(mean.shape)

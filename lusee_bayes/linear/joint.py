@@ -63,12 +63,10 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
     """
     if residual_root is None:
         return information
-    n = len(residual_root)
-    lower = residual_lower(information, residual_root)
+    n, lower = len(residual_root), residual_lower(information, residual_root)
     inverse = linalg.inverse_from_cholesky(lower)
     gradient = residual_root * information.vector[:n]
-    solved = inverse @ gradient
-    log_det = 2.0 * np.log(np.diagonal(lower)).sum()
+    solved, log_det = inverse @ gradient, 2.0 * np.log(np.diagonal(lower)).sum()
     matrix, vector = -inverse, solved / residual_root
     matrix[np.diag_indices_from(matrix)] += 1.0
     matrix = linalg.scaled(matrix, 1.0 / residual_root, overwrite=True)

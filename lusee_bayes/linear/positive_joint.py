@@ -246,8 +246,7 @@ def find_joint_mode(
         laws, last = replace(laws, parameters=laws.parameters + change), change
     raise InputError(
         f"the positive skies did not converge in {MAX_ROUNDS} rounds: the last step was "
-        f"{moved:.2g} standard deviations; the data are far from the templates: use "
-        "spectral.model=components"
+        f"{moved:.2g} standard deviations; use spectral.model=components"
     )
 
 

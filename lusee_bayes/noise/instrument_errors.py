@@ -277,8 +277,7 @@ def _band(
     def products(row: Array) -> Array:  # (products, times), at both times
         return row.T[:, None, :, None] * row.T[earlier][:, :, None, :]
 
-    weight = kernel[:, :, None, None]
-    band = sum(products(row) for row in slopes)
+    weight, band = kernel[:, :, None, None], sum(products(row) for row in slopes)
     if quadratic is not None:
         band = band + products(visibilities) * weight * quadratic[None, None]
     return band * weight

@@ -152,8 +152,7 @@ def exact_blocks(visibilities: Grid) -> Float[Array, "times products products"]:
         Cov[k, l] = Re( c_k conj(c_l) E[dV dV'*] + c_k c_l E[dV dV'] ) / 2.
     """
     i, j, imaginary = ports(round(np.sqrt(visibilities.shape[0])))
-    part = np.where(imaginary, -1j, 1.0 + 0j)
-    xp = namespace(visibilities)
+    part, xp = np.where(imaginary, -1j, 1.0 + 0j), namespace(visibilities)
     t = xp.moveaxis(to_matrix(visibilities), 2, 0)
     hermitian = t[:, i[:, None], i[None]] * t[:, j[:, None], j[None]].conj()
     pseudo = t[:, i[:, None], j[None]] * t[:, j[:, None], i[None]].conj()

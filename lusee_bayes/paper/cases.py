@@ -57,8 +57,7 @@ def sky_frequency_mhz(path: str | Path) -> float:
     match = re.search(r"exp(\d+(?:\.\d+)?)MHz", Path(path).name)
     if match is None or float(match[1]) == 0.0:
         raise InputError(
-            f"'{Path(path).name}' has no frequency as exp<F>MHz; name the file exp<F>MHz..., for "
-            "example exp10.0MHz_sky_map.hdf5"
+            f"'{Path(path).name}' states no frequency; name it as exp10.0MHz_sky_map.hdf5"
         )
     return float(match[1])
 

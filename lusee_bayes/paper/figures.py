@@ -95,8 +95,7 @@ def by_frequency(cases: Cases, metric: str) -> Figure:
     figure, axes = drawing.framed((8, 4.8))
     shades = colormaps["viridis"](np.linspace(0.0, 0.92, len(FREQUENCIES)))
     for k, (frequency, shade) in enumerate(zip(FREQUENCIES, shades, strict=True)):
-        curve = cases[frequency_case(frequency)][metric]
-        line = LINES[k % 2]
+        curve, line = cases[frequency_case(frequency)][metric], LINES[k % 2]
         axes.plot(curve["ell"][1:], curve[1:], color=shade, ls=line, label=f"{frequency} MHz")
     dress(axes, metric, int(curve["ell"][-1]))
     axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -326,8 +326,7 @@ class LocalScalesMember(Member):
     def forms(self, columns):
         family = self.family
         ells = 0.5 * sum_over_m((columns * (self.texture @ columns)).T).T
-        sizes = family.summed(0.5 * (family.sized.T @ columns) ** 2)
-        fields = []
+        sizes, fields = family.summed(0.5 * (family.sized.T @ columns) ** 2), []
         for band in family.bands:
             scale = _scale(band, self.spectrum)
             fields.append(band.grid.synthesise((scale[:, None] * columns[: len(scale)]).T) ** 2)
@@ -370,8 +369,7 @@ def embedded_local_scales(
         At this frequency, with the same lmax.
     """
     mean = np.asarray(galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)
-    constant = np.arange(len(mean)) == 0
-    level = mean[0] / np.sqrt(4.0 * np.pi)
+    constant, level = np.arange(len(mean)) == 0, mean[0] / np.sqrt(4.0 * np.pi)
     # these may be brighter or darker than their surroundings
     extended = [level * one.strength * one.modes(lmax) for one in EXTENDED_OBJECTS]
     scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * mean * constant, []

@@ -138,8 +138,7 @@ def describe_folder(folder: Path) -> list[str]:
     manifest = read_manifest(folder)
     if manifest is None:
         raise InputError(
-            f"'{folder}' is not the folder of a run (it has no manifest.json); give a file or the "
-            "folder of a finished run"
+            f"'{folder}' is not the folder of a run: no manifest.json; give a file or a folder"
         )
     lines = [f"results of lusee-bayes {manifest['kind']}"]
     provenance = "lusee_bayes.results.finished_runs:Provenance"

@@ -189,8 +189,7 @@ def write_report(folder: str | Path) -> Path:
     kind = manifest and manifest["kind"]
     if kind not in PAGES:
         raise InputError(
-            f"'{folder}' has no results of lusee-bayes map, sample or validate; give the "
-            "folder of a finished run"
+            f"'{folder}' has no results of map, sample or validate; give that of a finished run"
         )
     path = folder / REPORT
     with replacing(path) as partial:

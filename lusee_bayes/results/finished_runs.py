@@ -212,8 +212,7 @@ class SavedInformation:
         """
         if digest in self.digests:
             raise InputError(
-                "the earlier posterior already includes these data, and they would count twice; "
-                "give only new data"
+                "the earlier posterior already includes these data; give only new ones"
             )
         return information + self.information
 
@@ -270,8 +269,7 @@ def read_information(path: Path, channel: Scenario) -> SavedInformation:
         kept = tree.children.get(INFORMATION)
         if kept is None:
             raise InputError(
-                f"{path} does not contain the information of its data; make that map again with "
-                "--information"
+                f"{path} lacks the information of its data; make that map again with --information"
             )
         if name not in kept.children:
             raise InputError(

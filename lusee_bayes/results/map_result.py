@@ -220,8 +220,7 @@ class MapResult(Described):
             lines.append(
                 f"One parameter combination is nearly unconstrained at {len(left_open)} of "
                 f"{len(nulls)} frequencies. At {worst:g} MHz ({nulls[worst].words()}, in prior "
-                f"standard deviations) its variance is {nulls[worst].share:.0%} of the prior "
-                "variance."
+                f"standard deviations) its variance is {nulls[worst].share:.0%} of the prior's."
             )
         return lines
 

@@ -130,8 +130,7 @@ def signal_limit(
     smooth, t, y = chebvander(x, order), template(f), spectrum.temperature[k]
     if not np.isfinite(t).all() or np.abs(t).max() < FAINT:
         raise InputError(
-            f"{name}: the template vanishes, or is not finite, at the run's frequencies, "
-            f"{f.min():g} to {f.max():g} MHz"
+            f"{name}: the template vanishes or is not finite at {f.min():g} to {f.max():g} MHz"
         )
     if not (np.isfinite(y) & (y > 0.0)).all():
         raise InputError(f"the {region} has temperatures that are not positive")

@@ -384,8 +384,7 @@ class IndexMaps:
     ) -> IndexMaps:
         """Fit them to draws in K, at three or more frequencies."""
         reference = float(np.exp(np.log(frequencies_mhz).mean()))
-        x = np.log(frequencies_mhz / reference)
-        positive = (draws > 0.0).all(0)
+        x, positive = np.log(frequencies_mhz / reference), (draws > 0.0).all(0)
         log = np.log(np.where(positive, draws, 1.0))
         cells = zip(np.moveaxis(log, 2, 0), 1.0 / (draws.std(1) / draws.mean(1)).T, strict=True)
         fits = [np.polyfit(x, of_cell, 2, w=weight) for of_cell, weight in cells]

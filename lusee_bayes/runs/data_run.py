@@ -218,8 +218,7 @@ def run_simulate_flight(
     scenario, folder, stages = load_scenario(scenario), user_path(folder), stages or Stages()
     if not replace and (earlier := sorted(folder.glob("session_*"))):
         raise InputError(
-            f"'{folder}' already contains sessions ({earlier[0].name}); give -o another folder, or "
-            "--force"
+            f"'{folder}' already contains sessions ({earlier[0].name}); give another -o, or --force"
         )
     with run_folder(folder, FLIGHT, scenario, replace=replace) as run:
         made, place = simulate_flight(scenario, stages), run.path
@@ -387,8 +386,7 @@ def run_average(
     stages, path = stages or Stages(), user_path(path)
     if path.suffix == ".fits":
         raise InputError(
-            f"'{path}': averages have windows, which luseepy's waterfalls cannot store; give -o a "
-            "name that does not end in .fits"
+            f"'{path}': luseepy's waterfalls cannot store windows; give -o a name without .fits"
         )
     require_new(path, replace=replace, inputs=inputs_of(scenario, data))
     scenario.require_single("averages have")

@@ -246,6 +246,5 @@ class Marginal(dist.Distribution):
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute ln p(d) of one data vector, or of every row of an array."""
-        solver = self.model.factorise()
-        flat = value.reshape(-1, value.shape[-1])
+        solver, flat = self.model.factorise(), value.reshape(-1, value.shape[-1])
         return jax.vmap(solver.log_prob)(flat).reshape(value.shape[:-1])

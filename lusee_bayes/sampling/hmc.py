@@ -282,8 +282,7 @@ class Checkpoints:
             return
         if not marker.exists():
             raise InputError(
-                f"'{self.folder}' contains draws, but no {IDENTITY} to identify the run; delete "
-                "the folder"
+                f"'{self.folder}' contains draws, but no {IDENTITY} of their run; delete the folder"
             )
         if not resume:
             raise InputError(
@@ -298,8 +297,7 @@ class Checkpoints:
                 if was != line:
                     raise InputError(
                         f"the unfinished run in '{self.folder}' has another {name}: "
-                        f"{was.strip():.60}, now {line.strip():.60}; resume it with the same "
-                        "value, or delete the folder"
+                        f"{was.strip():.60}, now {line.strip():.60}; use it, or delete the folder"
                     )
 
     def _paths(self) -> list[Path]:
@@ -529,8 +527,7 @@ class Sampler:
         if self.algorithm == "crank-nicolson":
             if white is None:
                 raise InputError(
-                    "crank-nicolson needs coordinates in which all sites are jointly close to N(0, "
-                    "1), and found none; use nuts"
+                    "crank-nicolson found no coordinates in which sites are near N(0, 1); use nuts"
                 )
             site = white.names[0] + programs.WHITE_SUFFIX
             return CrankNicolson(model, site, n_white, self.trajectory, self.target_accept)
@@ -617,8 +614,7 @@ class _Run:
         white = set() if whitening is None else set(whitening.names)
         if unknown := white - set(latent):
             raise InputError(
-                f"the program has no latent site '{min(unknown)}' to whiten; it has "
-                f"{', '.join(latent)}"
+                f"the program has no latent site '{min(unknown)}'; it has {', '.join(latent)}"
             )
         self.sampler = sampler
         # arrays in the model's arguments are traced, everything else is static

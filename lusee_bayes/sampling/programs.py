@@ -120,8 +120,7 @@ class Program:
         if "coupling" in names and "offset" not in names and model.offset is not None:
             raise InputError(
                 f"the program '{self.name}' has the argument 'coupling' but not 'offset', and "
-                "these data include ground or receivers besides the sky; add 'offset', and use "
-                "coupling @ sky + offset"
+                "these data include ground or receivers; add 'offset': coupling @ sky + offset"
             )
         pieces = {name: partial(make, model) for name, make in PIECES.items()} | dict(more or {})
         for name in names:
@@ -169,8 +168,7 @@ def load_program(source: str | Path) -> Program:
             )
         if name != DATA and name not in pieces:
             raise InputError(
-                f"model in '{path}' asks for '{name}', which is neither data nor a piece; "
-                f"{nearest(name, pieces)}"
+                f"model in '{path}' asks for '{name}', not a piece; {nearest(name, pieces)}"
             )
     if DATA not in asked or asked[DATA].default is not None:
         raise InputError(
@@ -324,8 +322,7 @@ def require_sampleable(
         _require_shape(sites[SKY], (n_modes,), f"{who} {what}")
     elif not isinstance(returned, LinearGaussian):
         raise InputError(
-            f"{who} has no site 'sky' and returns no LinearGaussian to draw the sky from; do one "
-            "of the two"
+            f"{who} has no site 'sky' and returns no LinearGaussian to draw the sky from; do either"
         )
     with _blaming(who, "when it is called with data=None"):
         drawn = latent_sites(program.model, {**arguments, DATA: None})
@@ -335,8 +332,7 @@ def require_sampleable(
         )
     if differing := {*drawn} ^ {*latent, DATA}:
         raise InputError(
-            f"{who} samples '{min(differing)}' only with data, or only without; sample the same "
-            "sites in both cases"
+            f"{who} samples '{min(differing)}' only with data, or only without; sample it in both"
         )
 
     def slope(arguments):

@@ -479,8 +479,7 @@ class Slabs:
                     continue
                 overlap = np.minimum(leave, begin + length) - np.maximum(enter, begin)
                 share = left * np.maximum(overlap, 0.0) / length
-                local = local + share * region.n_squared_cm6
-                left = left - share
+                local, left = local + share * region.n_squared_cm6, left - share
             column[k] = length * (left * smooth + local)
         return cls(emitted, column)
 

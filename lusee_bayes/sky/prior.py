@@ -166,8 +166,7 @@ class DensePrior(Prior):
         above = any(row[k + 1 :].any() for k, row in enumerate(root))
         if above or not (np.diagonal(root) > 0).all():
             raise InputError(
-                "the root of the prior must be lower triangular with a positive diagonal; give the "
-                "Cholesky factor of S"
+                "the root of the prior must be a Cholesky factor: lower triangular, diagonal > 0"
             )
 
     @classmethod
@@ -342,8 +341,7 @@ class HarmonicPrior(DiagonalPrior):
         fixed = np.flatnonzero((np.asarray(self.mean) != 0.0) & ~(np.asarray(self.variance()) > 0))
         if fixed.size:
             raise InputError(
-                f"the prior mean has power at ell = {int(np.sqrt(fixed[0]))}, where C_ell is zero; "
-                "give that ell a variance"
+                f"the prior mean has power at ell = {int(np.sqrt(fixed[0]))}, where C_ell is zero"
             )
 
     def description(self) -> tuple[str, ...]:
@@ -422,8 +420,7 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
     if missing := [ell for ell in range(lmax + 1) if ell not in ells]:
         several = f" and {len(missing) - 1} more up to lmax = {lmax}" if len(missing) > 1 else ""
         raise InputError(
-            f"{path} has no C_ell at ell = {missing[0]}{several}; give every ell from 0 to lmax, "
-            "or lower lmax"
+            f"{path} has no C_ell at ell = {missing[0]}{several}; give all up to lmax, or lower it"
         )
     if not (spectrum := checked["C_ell"][: lmax + 1]).any():
         raise InputError(f"{path}: C_ell is zero at every ell up to {lmax}; a prior needs variance")

@@ -351,8 +351,7 @@ class SkyAlms(SkyFile):
             frequencies, alm = arrays["freq"], arrays["alm"]
             if healpy.Alm.getlmax(alm.shape[1]) < 0:
                 raise InputError(
-                    f"{path}: alm has {alm.shape[1]} coefficients, expected (lmax + 1) "
-                    "(lmax + 2) / 2"
+                    f"{path}: alm has {alm.shape[1]} values, expected (lmax + 1) (lmax + 2) / 2"
                 )
         else:
             frequencies, alm = None, _read_alm_fits(path)
@@ -539,8 +538,7 @@ class SkyCube(SkyFile):
         if not ((low > 0) & (high > 0)).all():
             raise InputError(
                 f"{self.path} has pixels that are not positive at {mhz[above - 1]:g} or "
-                f"{mhz[above]:g} MHz, so that no power law interpolates between them; use a "
-                "frequency of the file"
+                f"{mhz[above]:g} MHz, so that no power law is between them; use a frequency of it"
             )
         share = np.log(frequency_mhz / mhz[above - 1]) / np.log(mhz[above] / mhz[above - 1])
         return low * (high / low) ** share

@@ -90,8 +90,7 @@ class GainSection(Section):
 
     _scales_are_sampled = requires(
         lambda s: s.treatment != "marginalised" or not (s.log_sigma_std or s.log_correlation_std),
-        "log_sigma_std and log_correlation_std need treatment 'sampled': a covariance has fixed "
-        "scales",
+        "log_sigma_std and log_correlation_std need treatment 'sampled': a covariance is fixed",
     )
 
 

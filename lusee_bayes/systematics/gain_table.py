@@ -93,8 +93,7 @@ class GainTable(Systematic):
         named = calibration is not None and calibration.gain_slope is not None
         if named and std is not None:
             raise InputError(
-                "the data already contain the errors of their gain table; remove "
-                "noise.gain_table.std"
+                "the data contain the errors of their gain table; remove noise.gain_table.std"
             )
         if not named:
             if std is None and setup.scenario.flight is not None:
@@ -103,13 +102,11 @@ class GainTable(Systematic):
                 if std is not None and std > LARGEST:
                     raise InputError(
                         f"flight.gain_std is {std:g}, but relative errors of power gains above "
-                        f"{LARGEST:g} are not modelled; give a smaller noise.gain_table.std for "
-                        "simulated data"
+                        f"{LARGEST:g} are not modelled; give a smaller noise.gain_table.std"
                     )
             if std is None:
                 raise InputError(
-                    "the data contain no gain table; give noise.gain_table.std, the relative error "
-                    "of every port's power gain"
+                    "the data contain no gain table; give noise.gain_table.std, of each power gain"
                 )
             n_ports = setup.beam_source.n_ports
             slope = np.full((n_ports, setup.layout.n_times), std)

@@ -104,8 +104,7 @@ class PriorSpectrum(Scale):
         """
         if not isinstance(model.prior, HarmonicPrior):
             raise InputError(
-                f"a sampled spectrum needs an isotropic prior, got {type(model.prior).__name__}; "
-                "use a HarmonicPrior"
+                f"a sampled spectrum needs a HarmonicPrior, got {type(model.prior).__name__}"
             )
         spectrum = model.prior.spectrum
         ell = np.arange(spectrum.shape[0])

@@ -71,8 +71,7 @@ class SourceSection(Section):
         if self.name in CATALOGUE:
             return float(CATALOGUE[self.name].kelvin_steradian(frequency_mhz))
         raise InputError(
-            f"the source '{self.name}' is not in the catalogue, so that its flux is unknown; give "
-            "flux_jy, the mean of its prior"
+            f"the source '{self.name}' is not in the catalogue; give flux_jy, the mean of its prior"
         )
 
     def direction(self, observation: Observation) -> Float[np.ndarray, "..."]:
@@ -84,8 +83,8 @@ class SourceSection(Section):
         source = CATALOGUE.get(self.name)
         if source is None:
             raise InputError(
-                f"unknown source '{self.name}'; {nearest(self.name, [*CATALOGUE, *BODIES])} (or "
-                "give ra_deg and dec_deg)"
+                f"unknown source '{self.name}' without ra_deg and dec_deg; "
+                f"{nearest(self.name, [*CATALOGUE, *BODIES])}"
             )
         return galactic_unit_vector(source.ra_deg, source.dec_deg)
 

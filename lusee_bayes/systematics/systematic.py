@@ -161,8 +161,7 @@ class Unknown(eqx.Module):
             edge = f"at least {low:g}" if mean - low < high - mean else f"at most {high:g}"
             raise InputError(
                 f"the prior of {self.name}, {mean:g} +- {std:g}, has {outside:.1%} of its weight "
-                f"outside the allowed range ({edge}); give a smaller standard deviation or move "
-                "the mean"
+                f"outside the allowed range ({edge}); give a smaller deviation, or move the mean"
             )
         ends = {name: end for name, end in (("low", low), ("high", high)) if np.isfinite(end)}
         return dist.TruncatedNormal(mean, std, **ends)
@@ -291,8 +290,7 @@ class Systematic(eqx.Module):
         for name in said:
             if name not in drawn:
                 raise InputError(
-                    f"{cls.key}.true_values has '{name}', which has no prior; "
-                    f"{nearest(name, tuple(drawn))}"
+                    f"{cls.key}.true_values has an unknown '{name}'; {nearest(name, tuple(drawn))}"
                 )
         return drawn | {name: float(value) for name, value in said.items()}
 

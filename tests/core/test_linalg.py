@@ -103,8 +103,7 @@ def test_factors_are_clean_and_in_place_on_request():
     """L alone, whatever stands above the diagonal; a matrix stays unless it may be overwritten."""
     matrix = spd(40)
     given = matrix + np.triu(np.full((40, 40), np.nan), 1)
-    kept = given.copy()
-    lower = la.cholesky(given)
+    kept, lower = given.copy(), la.cholesky(given)
     np.testing.assert_allclose(lower @ lower.T, matrix, rtol=0, atol=1e-13)
     np.testing.assert_array_equal(given, kept)
     assert la.cholesky(given, overwrite=True) is given

@@ -246,12 +246,14 @@ def test_the_cause_is_named(absent):
 
 
 @pytest.mark.essential
-def test_independent_noise_is_named_where_products_are_correlated():
-    data = wrong_data.measured(wrong_data.scenario(6), sky(6), 1)
-    experiment = lb.build(wrong_data.scenario(6, "noise.radiometer.form=paper"), data)
+@pytest.mark.parametrize(("right", "wrong"), [("exact", "paper"), ("paper", "exact")])
+def test_the_form_of_the_noise_is_named(right, wrong):
+    right, wrong = (wrong_data.scenario(6, f"noise.radiometer.form={f}") for f in (right, wrong))
+    data = wrong_data.measured(right, sky(6), 1)
+    experiment = lb.build(wrong, data)
     found = lb.infer(experiment)
     (first,) = diagnosis.diagnose(experiment, found, residuals(found.solution, data)).proposals
-    assert "form=exact" in first.remedy and first.chi2.fits
+    assert right.noise.radiometer.form in first.remedy and first.chi2.fits
 
 
 @pytest.mark.long

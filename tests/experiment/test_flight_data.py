@@ -210,7 +210,7 @@ NO_SESSIONS = [
     (["noise.radiometer.duty_cycle=0.5"], "remove duty_cycle"),
     (["flight.filter_taps=4"], "independent noise"),
     (["observation.step_s=1e-5", "observation.runs=[{cycles: 1e-10}]"], "a frame of"),
-    (["noise.gain_table={}"], "errors of the gains; give flight.gain_std"),
+    (["noise.gain_table={}"], "errors of the gains: flight.gain_std"),
     (["noise.gain_table={std: 0.01}"], "give flight.gain_std, the error of the gains"),
     (["noise.gain_table={}", "flight.gain_std=0.9", "seed=2"], "is negative"),
 ]
@@ -377,8 +377,7 @@ def test_volts_that_beams_do_not_know_can_be_given(flight):
 
 
 def test_sessions_are_given_once_not_mixed_with_other_files_and_of_the_site(flight):
-    scenario = scenario_of(flight)
-    one = files(flight)[0]
+    scenario, one = scenario_of(flight), files(flight)[0]
     refuse("twice", reduce_files, [one, one], scenario)
     refuse("truth.npz", lb.read_data, [one, flight / "truth.npz"], scenario)
     elsewhere = scenario_of(flight, "observation.lat_deg=-20.0")

@@ -213,7 +213,7 @@ def test_a_prior_is_learned_about_the_offsets():
 def test_what_cannot_be():
     for section, words in (
         ("lat_deg: 1, true_values: {lat_deg: 200}", "with lat_deg = 200: lat_deg must lie"),
-        ("clock_s: 1, true_values: {lat_deg: 1}", "true_values has 'lat_deg', which has no prior"),
+        ("clock_s: 1, true_values: {lat_deg: 1}", "true_values has an unknown 'lat_deg'"),
     ):
         refuse(words, simulate, set_up(scenario_of(f"noise.pointing={{{section}}}", lmax=4)))
 

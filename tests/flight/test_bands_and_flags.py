@@ -200,8 +200,7 @@ def test_what_the_degree_leaves_out_is_told_by_two_more_powers():
     """A power law about 10 MHz: a mean over 1 MHz is 0.4 % off, a parabola 5e-6."""
     mhz = channel_mhz("centre")
     law = (mhz[1:] / 10.0) ** -2.5
-    law = np.append(law[0], law)
-    off = {}
+    law, off = np.append(law[0], law), {}
     for degree in (0, 2):
         band = ChannelBand.of(10.0, 1.0, degree, AVERAGING[1], mhz)
         here = law[None, band.first : band.last]
@@ -267,8 +266,7 @@ def test_filter_banks_share_noise_as_noise_through_them_does(taps, taper):
             y = np.fft.fft((x[:, t * n : (t + taps) * n] * h).reshape(500, taps, n).sum(axis=1))
             power[start : start + 500] += np.abs(y[:, : n // 2]) ** 2 / frames
     power /= power.mean(axis=0)
-    inner = np.arange(3, n // 2 - 5)
-    covariance = np.cov(power.T) * frames
+    inner, covariance = np.arange(3, n // 2 - 5), np.cov(power.T) * frames
     expected = shared_noise(taps, taper)
     for apart in range(3):
         # of 3000 sets a variance scatters by 2.6 %, of the mean over channels by less; frames at

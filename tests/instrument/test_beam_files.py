@@ -85,8 +85,7 @@ def test_what_the_rectangle_rule_costs(luseepy):
 
     Between nodes that integrate across the cut nothing changes when their number doubles.
     """
-    beam = luseepy[0]
-    ours = visibilities(luseepy, 25.0)
+    beam, ours = luseepy[0], visibilities(luseepy, 25.0)
     cost = off(luseepy[1][25.0], ours)
     assert 1e-4 < cost < 2e-4
     more = HemisphereGrid.gauss_legendre(4 * len(beam.theta), 360)
@@ -173,8 +172,7 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     gain = 0.3 * 100.0 / 20.0 + 0.7 * 100.0 / 30.0
     expected = gain / (4 * np.pi) * (0.3 * crossed[20.0] + 0.7 * crossed[30.0])
     beam = replace(beam, taper=False, rotations_deg=angles, moon_k=2.0)
-    got = beam.beams(27.0, 4).modes
-    largest = np.abs(expected).max()
+    got, largest = beam.beams(27.0, 4).modes, np.abs(expected).max()
     within(got, expected, 1e-5 * largest)
     splined = replace(beam, interpolation="spline").beams(27.0, 4).modes
     assert np.abs(splined - expected).max() > 1e-2 * largest

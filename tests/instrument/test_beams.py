@@ -69,8 +69,7 @@ def test_normalised_autos_average_to_one():
     fields = random_fields(7, 3, GRID)
     uniform = np.sqrt(4 * np.pi)  # the monopole coefficient of a sky of 1 K
     raw = bf.product_modes(fields, 4, normalise=False)
-    scaled = bf.product_modes(fields, 4)
-    autos = auto_indices(3)
+    scaled, autos = bf.product_modes(fields, 4), auto_indices(3)
     mean = np.mean(np.asarray(raw)[autos, 0]) * uniform
     np.testing.assert_allclose(mean, bf.mean_auto_integral(fields), rtol=1e-13)
     assert np.mean(np.asarray(scaled)[autos, 0]) * uniform == pytest.approx(1.0, rel=1e-13)
@@ -112,8 +111,7 @@ def test_a_band_limited_pattern_above_the_horizon_is_integrated_as_it_is_given()
     grid = BandLimitedGrid.of(theta, 16)
     weights = grid.polar_weights(lmax)
     ell, m = mode_numbers(lmax)
-    polar = polar_functions(theta, lmax)
-    mirror = (-1.0) ** (ell + m)
+    polar, mirror = polar_functions(theta, lmax), (-1.0) ** (ell + m)
     # coefficients of lambda_lm of given m over the whole sphere: (1 + mirror mirror') of the half
     for k in range(len(ell)):
         same = m == m[k]
@@ -129,7 +127,6 @@ def test_the_rectangle_rule():
     n = 91
     fields = np.ones((1, n, 180), dtype=complex)
     beam = ScalarBeam("", np.ones(1), np.linspace(0.0, np.pi / 2, n), fields, fields, np.ones(1))
-    grid = beam.luseepy_grid()
-    step = np.pi / 180
+    grid, step = beam.luseepy_grid(), np.pi / 180
     found, expected = grid.integrate(np.ones((1, n, 180))), 1.0 + step / 2 - step**2 / 12
     assert float(found[0]) == pytest.approx(2 * np.pi * expected, rel=1e-9)

@@ -167,7 +167,7 @@ def test_what_cannot_be_is_refused(tables, tmp_path, capsys):
     words = "surface_permittivity is 4.2, but the files cover 3.3 to 4.1; give a value in"
     refuse(words, read_beam_grid, table, {"surface_permittivity": 4.2})
     refuse("did you mean 'zenith_angle_deg'", read_beam_grid, table, {"zenit_angle_deg": 75.0})
-    refuse("give a smaller standard deviation", lb.build, scenario(table, 4.0))
+    refuse("give a smaller deviation", lb.build, scenario(table, 4.0))
     rows = [("a", 1, 2), ("b", 1, 3), ("c", 2, 2), ("d", 2, 3)]
     said = "has no files for surface_permittivity 2, zenith_angle_deg 3; expected one file"
     refuse(said, read_beam_grid, write_table(tmp_path, rows[:3]))

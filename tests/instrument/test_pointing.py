@@ -89,8 +89,7 @@ def test_inside_a_compiled_function_as_exactly_shifted(names):
 def test_offsets_are_differentiable():
     o, beams = two_runs(), lb.monopole_beams(25.0, 2)
     nominal = pt.Pointing.of(o, 2)
-    a = jnp.asarray(steep_sky(2))
-    names = list(VALUES)
+    a, names = jnp.asarray(steep_sky(2)), list(VALUES)
 
     def total(values):
         pointing = pt.turned_by_offsets(nominal, o.hours, dict(zip(names, values, strict=True)))
@@ -98,8 +97,7 @@ def test_offsets_are_differentiable():
         v = lb.CouplingMatrix.of_modes(jnp.asarray(beams.modes), pointing, layout) @ a
         return (v * jnp.cos(jnp.arange(v.size))).sum()
 
-    at = jnp.asarray(list(VALUES.values()))
-    total = jax.jit(total)
+    at, total = jnp.asarray(list(VALUES.values())), jax.jit(total)
     slopes = jax.jit(jax.grad(total))(at)
     for k in range(len(names)):
         step = 1e-3 * at[k]

@@ -136,8 +136,7 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
         pairs = sum(np.einsum("ip,jp,pm->ijm", h[:, k], h[:, k].conj(), harmonics)
                     for h in images.values())  # fmt: skip
         open_.append(Boltzmann * VACUUM * (1e6 * mhz / c) ** 2 * pairs)
-    za = between(response.impedance_ohm, part)
-    zl = JFETReceiver().load(f)
+    za, zl = between(response.impedance_ohm, part), JFETReceiver().load(f)
     m = zl @ np.linalg.inv(za + zl)
     expected = np.einsum("ai,ijm,bj->abm", m, between(open_, part), m.conj())
     largest = np.abs(expected).max()
@@ -211,7 +210,7 @@ UNUSABLE = [
     ("freq", lambda f: f[::-1].copy(), "freq does not increase"),
     ("ZA_real", lambda za: za[:, :3], "ZA_real has shape"),
     ("Rmoon", lambda r: 2 * r, "Rsky . Rmoon . Rloss differ"),
-    ("theta", lambda theta: 2 * theta, "theta goes from 0 to 180 degrees"),
+    ("theta", lambda theta: 2 * theta, "theta goes 0 to 180, expected 0 to 90"),
 ]
 
 
@@ -254,7 +253,7 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
 
 OPEN = ["beam.file={response}", "beam.moon_temperature_k=250", "beam.receiver=open"]
 OTHERS = [
-    ([], "give its response as beam.file"),
+    ([], "give the response as beam.file"),
     (OPEN[:1], "use --set beam.moon_temperature_k=250"),
     (OPEN, "remove beam.receiver to use the loads ZL in the data"),
     (["frequency_mhz=11"], "no channel at 11 MHz"),
@@ -409,8 +408,7 @@ def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_pat
     response, *_ = luseepy
     path, moon, capacitor = tmp_path / "w.fits", 251.23456789012345, "{model: capacitor}"
     beam = [f"beam.file={response.path}", "lmax=4", "observation.runs.0.cycles=0.03"]
-    warm = f"beam.moon_temperature_k={moon!r}"
-    f = 14.5 / 3 + 2.0
+    warm, f = f"beam.moon_temperature_k={moon!r}", 14.5 / 3 + 2.0
 
     def simulate(*further):
         command = ["simulate", "fiducial", "-o", path, "--frequencies", f"{f!r},10", "-q"]

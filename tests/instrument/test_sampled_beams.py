@@ -114,8 +114,9 @@ def test_rings_go_through_the_zenith():
     expected = wave(theta[:, None], phi[None])
     found = from_rings(np.where(UP, wave(THETA, PHI), np.nan), theta, phi)
     # orders +-3 in the first ring, at theta = sqrt(2/3) / NSIDE: J_3(x) = (x / 2)^3 / 6 each
-    aliased = 2 * (4 * np.sqrt(2 / 3) / NSIDE / 2) ** 3 / 6
-    assert np.abs(found - expected).max() < BETWEEN + aliased
+    assert np.abs(found - expected).max() < BETWEEN + (
+        2 * (4 * np.sqrt(2 / 3) / NSIDE / 2) ** 3 / 6
+    )
     # a real function stays real
     real = from_rings(np.where(UP, wave(THETA, PHI).real, 0.0), theta, phi)
     np.testing.assert_allclose(real, found.real, atol=1e-12)
@@ -294,8 +295,7 @@ def test_a_uvbeam_is_its_fields(tmp_path, coordinates):
 
 
 def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, monkeypatch):
-    path = tmp_path / "uv.fits"
-    hdu = fits.PrimaryHDU(np.zeros((2, 2)))
+    path, hdu = tmp_path / "uv.fits", fits.PrimaryHDU(np.zeros((2, 2)))
     hdu.header["NORMSTD"], hdu.header["FEEDLIST"] = "physical", "[x, y]"
     hdu.writeto(path)
     monkeypatch.setattr("lusee_bayes.instrument.beams.sampled.find_spec", lambda name: None)

@@ -120,8 +120,7 @@ def test_windows_at_night_are_dark_from_end_to_end():
     intervals = [Interval(*pair, night_only=True) for pair in dates]
     given = {"step_s": step_s, "lon_deg": lon, "lat_deg": lat}
     o = lb.Observation.from_schedule(intervals, **given)
-    windows = naive(intervals, step_s)
-    start, end = (Time([w[k] for w in windows]) for k in (0, 1))
+    start, end = (Time([w[k] for w in naive(intervals, step_s)]) for k in (0, 1))
     middle = start + (end - start) / 2.0
     dark = np.array([is_dark(times, lon, lat) for times in (start, middle, end)])
     expected = dark.all(axis=0)

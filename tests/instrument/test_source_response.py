@@ -141,8 +141,7 @@ def test_a_field_that_turns_in_time(stokes_v):
 def smoothed_source(n0, sigma, lmax):
     """Modes of a Gaussian of 1 K sr around n0: g_l Y_lm(n0), and its g_l."""
     ell = np.arange(lmax + 1)
-    g = np.exp(-ell * (ell + 1) * sigma**2 / 2)
-    n0 = n0[None]
+    g, n0 = np.exp(-ell * (ell + 1) * sigma**2 / 2), n0[None]
     y = real_harmonics(np.arccos(n0[:, 2]), np.arctan2(n0[:, 1], n0[:, 0]), lmax)[0]
     return y * np.repeat(g, 2 * ell + 1), g
 

@@ -72,11 +72,9 @@ def naive(data, to_s):
     """Bins as lists of (run, values by product, pieces), by loops over the module's rule."""
     observation, grid = data.observation, data.grid()
     there = ~np.isnan(grid)
-    pieces = pieces_of(observation, observation.times[0])
-    bins = {}
+    pieces, bins = pieces_of(observation, observation.times[0]), {}
     for k, run in enumerate(observation.run):
-        first = list(observation.run).index(run)
-        place = (pieces[k][0][0] - pieces[first][0][0] + 1e-3) // to_s
+        place = (pieces[k][0][0] - pieces[list(observation.run).index(run)][0][0] + 1e-3) // to_s
         bins.setdefault((run, place), []).append(k)
     found = []
     for (run, _), members in bins.items():
@@ -196,8 +194,7 @@ def test_bins_of_which_nothing_remains_are_dropped():
     assert found.observation.n_times == 1 and found.n_missing == 0
     # no product is there for half of the time, or none with another
     rarely = flagged(*((p, k) for p in range(16) for k in range(4) if p % 4 != k))
-    halves = flagged(*((p, k) for p in range(16) for k in range(4) if p % 2 != k % 2))
-    for data in (rarely, halves):
+    for data in (rarely, flagged(*((p, k) for p in range(16) for k in range(4) if p % 2 != k % 2))):
         refuse("averaging.*2400 s.*no data", averaged, data, 4 * STEP)
 
 

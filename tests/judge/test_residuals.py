@@ -61,8 +61,7 @@ def of_kind(found, kind):
 
 def by_hand(model, data, index, prior):
     """chi^2 of some data given all others, by the textbook's conditional of a Gaussian."""
-    k = covariance_of(model, prior)
-    d = np.asarray(data.data)
+    k, d = covariance_of(model, prior), np.asarray(data.data)
     rest = np.setdiff1d(np.arange(len(d)), index)
     gain = np.linalg.solve(k[np.ix_(rest, rest)], k[np.ix_(rest, index)]).T
     off = d[index] - gain @ d[rest]
@@ -272,8 +271,7 @@ def test_the_two_parts_by_matrices(strength):
     data = drawn(model, np.random.default_rng(3), strength)
     found, posterior, chi2 = split_of(model, data)
     a, s, n = matrices(model)
-    d = np.asarray(data - model.offset)
-    k = a @ s @ a.T + n
+    d, k = np.asarray(data - model.offset), a @ s @ a.T + n
     # how strong the sky is: |u|^2 over its mean, tr (1 - C S^-1), at least 1
     known = N_MODES - np.trace(np.asarray(posterior.covariance()) @ np.linalg.inv(s))
     power = max(1.0, float(posterior.prior_chi2()) / known)

@@ -97,8 +97,7 @@ def test_textbook_matrices_and_scipys_evidence(n_data, form):
 
 
 def test_pixels_of_the_prior():
-    prior = DensePrior(np.linalg.cholesky(S))
-    rest = S.copy()
+    prior, rest = DensePrior(np.linalg.cholesky(S)), S.copy()
     rest[0] = rest[:, 0] = 0.0
     np.testing.assert_allclose(prior_pixel_std(prior, 4), pixel_std(rest, 4), rtol=1e-12)
     same = lb.HarmonicPrior(SPECTRUM), DensePrior(np.diag(np.sqrt(PER_MODE)))

@@ -77,8 +77,7 @@ def information_from(made, data):
 def drawn(prior, made, seed=2):
     rng, s = np.random.default_rng(seed), covariance_of(prior)
     sky = np.linalg.cholesky(s + 1e-12 * np.diag(np.diag(s))) @ rng.standard_normal(len(s))
-    sky = sky.reshape(len(made), N_MODES)
-    data = []
+    sky, data = sky.reshape(len(made), N_MODES), []
     for model, own in zip(made, sky, strict=True):
         noise = np.sqrt(np.asarray(model.noise.variance)) * rng.standard_normal(model.n_data)
         data.append(np.asarray(model.coupling.dense()) @ own + noise)
@@ -146,8 +145,7 @@ def test_skies_that_do_not_obey_the_prior_are_told():
         for prior_name, prior in (("true", true), ("wrong", wrong)):
             solved = solve_directly(prior, channels, reference)
             maps, none = solved.mean, jnp.zeros((0, len(solved.mean)))
-            spread = joint.paired(solved.covariance(), prior)
-            far = []
+            spread, far = joint.paired(solved.covariance(), prior), []
             for k, t in enumerate(channels):
                 sky = joint.channel_sky(prior, k, t, maps, spread, none, jax.random.key(0))
                 fit = t.fit(sky.mean, sky.covariance)

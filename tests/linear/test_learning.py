@@ -297,8 +297,7 @@ def one_parameter():
     """Modes that are seen with noise from a tenth to ten times their strength; theta = 0.4 +- 1."""
     family, width = Strength(np.ones((LOW + 1, 1)), PRIOR), 1.0
     noise = np.geomspace(0.1, 10.0, SIZE) * SCALE
-    seen = 2.0 * SCALE * np.ones(SIZE)
-    unknown = [np.asarray(0.0)] * 3
+    seen, unknown = 2.0 * SCALE * np.ones(SIZE), [np.asarray(0.0)] * 3
     information = Information(np.diag(noise**-2.0), seen / noise**2, np.zeros(SIZE), *unknown)
     prior = family.prior(family.at(np.array([0.4])).covariance)
     theta, covariance = np.array([0.4]), np.array([[width**2]])

@@ -219,8 +219,7 @@ def graded(n_data: int, largest: float, lmax=5, seed=1):
 @pytest.mark.parametrize("form", FORMS)
 def test_high_signal_to_noise_to_sixty_digits(form, n_data, largest):
     model, d, exact = graded(n_data, largest)
-    post = model.condition(d, form).posterior
-    eps = np.finfo(float).eps
+    post, eps = model.condition(d, form).posterior, np.finfo(float).eps
     linear, squared = 1e-13 + 10 * eps * largest, 1e-12 + 10 * eps * largest**2
     lost = squared if form is not InData else linear
     refined = linear if form is not FromInformation else 3 * linear
@@ -292,8 +291,7 @@ def test_slopes_of_the_evidence(derivative, n_data):
 
 def test_evidence_inside_jit_and_vmap():
     model, d = well_scaled(30)
-    value = log_prob_of(model, d)
-    levels = jnp.array([0.5, 1.0, 4.0])
+    value, levels = log_prob_of(model, d), jnp.array([0.5, 1.0, 4.0])
     got = jax.jit(jax.vmap(value, (None, 0)))(jnp.asarray(SPECTRUM), levels)
     for level, log_prob in zip(levels, got, strict=True):
         scaled = lb.LinearGaussian(model.coupling, model.prior, model.noise.scaled(float(level)))

@@ -70,8 +70,7 @@ CASES = [(2, 0.3, complete), (2, 1e-3, gappy), (4, 0.3, gappy)]
 
 @pytest.mark.parametrize(("n_antennas", "sigma", "make_flags"), CASES)
 def test_every_entry_is_the_papers(n_antennas, sigma, make_flags):
-    flags = make_flags(n_antennas)
-    d = visibilities(n_antennas)
+    flags, d = make_flags(n_antennas), visibilities(n_antennas)
     expected = by_the_papers_equation(d, HOURS, sigma, 10.0, flags)
     got = term(GainDrift(sigma, 10.0), d, HOURS, flags)
     # a few roundings; entries beyond the band are below eps of the largest by its definition
@@ -82,8 +81,7 @@ def test_every_entry_is_the_papers(n_antennas, sigma, make_flags):
 def gain_histories(rng, n, n_antennas, sigma, correlation=10.0):
     """(n, antennas, times) draws of C_g, by its eigenvectors."""
     value, vector = np.linalg.eigh(c_g(HOURS, sigma, correlation))
-    root = vector * np.sqrt(np.maximum(value, 0.0))
-    return rng.normal(size=(n, n_antennas, N_TIMES)) @ root.T
+    return rng.normal(size=(n, n_antennas, N_TIMES)) @ (vector * np.sqrt(np.maximum(value, 0.0))).T
 
 
 def test_mean_and_covariance_of_simulated_histories():
@@ -96,8 +94,7 @@ def test_mean_and_covariance_of_simulated_histories():
     """
     n_antennas, sigma, n, chunk = 3, 0.3, 100_000, 20_000
     rng, d = np.random.default_rng(20270115), visibilities(n_antennas)
-    flags = gappy(n_antennas)
-    drift = GainDrift(sigma, 10.0)
+    flags, drift = gappy(n_antennas), GainDrift(sigma, 10.0)
     response = np.array([1.0 + sigma**2 * (i == j) for i, j in pairs(n_antennas)])
     np.testing.assert_allclose(drift.mean_response(n_antennas**2), response, rtol=1e-15)
     keep = ~flags.ravel()
@@ -109,8 +106,7 @@ def test_mean_and_covariance_of_simulated_histories():
         gains = gain_histories(rng, chunk, n_antennas, sigma)
         data = np.asarray(many(jnp.asarray(d), jnp.asarray(gains))).reshape(chunk, -1)[:, keep]
         e = (data - mean) / scale
-        first = first + e.sum(0) / n
-        second = second + e.T @ e / n
+        first, second = first + e.sum(0) / n, second + e.T @ e / n
         fourth = fourth + (e**2).T @ e**2 / n
     expected = np.asarray(term(drift, d, HOURS, flags).dense()) / np.outer(scale, scale)
     off = np.abs(first) / np.sqrt(np.diag(second) / n)
@@ -119,8 +115,7 @@ def test_mean_and_covariance_of_simulated_histories():
     assert off.max() < z_of(off.size), f"covariance off by {off.max():.2f} sigma"
 
     # what such a sample tells apart: the linear term alone, and the autos without their shift
-    names = [pairs(n_antennas)[k] for k in np.nonzero(~flags)[0]]
-    auto = np.array([i == j for i, j in names])
+    auto = np.array([i == j for i, j in [pairs(n_antennas)[k] for k in np.nonzero(~flags)[0]]])
     shift = (sigma**2 * np.abs(d).ravel()[keep] / scale)[auto]
     assert (shift / np.sqrt(np.diag(second)[auto] / n)).min() > 8
     quadratic = np.where(auto, 2.0, 1.0) * sigma**2
@@ -221,8 +216,7 @@ def test_bad_visibilities_are_refused():
     d = jnp.asarray(visibilities(2))
     short, shapes = d[:, :5], r"the visibilities has shape \(4, 5\), expected \(4, 6\)"
     refuse(shapes, drift.covariance, short, HOURS[:5], layout)
-    bad = d.at[2, 1].set(jnp.nan)
-    refuse(r"visibilities.*NaN.*\(2, 1\)", drift.covariance, bad, HOURS, layout)
+    refuse(r"visibilities.*NaN.*\(2, 1\)", drift.covariance, d.at[2, 1].set(jnp.nan), HOURS, layout)
 
 
 def test_the_term_alone_is_not_a_noise():
@@ -237,8 +231,7 @@ def test_about_found_drifts_it_is_linear_in_the_rest():
     found = gain_histories(np.random.default_rng(2), 1, 4, 0.3)[0]
     slopes = jax.jacfwd(lambda g: with_gains(jnp.asarray(d), g))(jnp.asarray(found))
     slopes = np.asarray(slopes)[~flags]  # (data, antennas, times)
-    kernel = c_g(HOURS, 0.3, 10.0)
-    layout = DataLayout.from_flags(flags)
+    kernel, layout = c_g(HOURS, 0.3, 10.0), DataLayout.from_flags(flags)
     got = drift.covariance(jnp.asarray(d), HOURS, layout, gains=jnp.asarray(found))
     close(got.dense(), np.einsum("kat,ts,las->kl", slopes, kernel, slopes), 1e-15 * 8)
     x = np.random.default_rng(3).normal(size=(4, N_TIMES))

@@ -179,7 +179,7 @@ def test_the_nearest_sky_in_log_frequency_is_scaled(tmp_path):
 @pytest.mark.parametrize("name", ["sky.hdf5", "exp_10MHz.hdf5", "exp0MHz.hdf5"])
 def test_a_name_without_frequency_is_refused(tmp_path, name):
     (tmp_path / name).touch()
-    refuse("has no frequency as exp<F>MHz", paper.sky_frequency_mhz, tmp_path / name)
+    refuse("states no frequency; name it as exp", paper.sky_frequency_mhz, tmp_path / name)
     refuse("no sky map at", paper.sky_frequency_mhz, tmp_path / "exp5MHz.hdf5")
 
 
@@ -215,8 +215,7 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
     noise = np.full_like(data, np.sqrt(2) if name == "duty_cycle_50" else 1.0)
     n_data = {"three_cycles": 3, "half_cycle": 0.5}.get(name, 1) * 5232
     rms, products = 0.01 if "0.4" in name else 0.1, list(labels())
-    scenario = whole_paper()[name].to_yaml()
-    seen_at = frequency
+    scenario, seen_at = whole_paper()[name].to_yaml(), frequency
     if not agrees:
         # fidelity: everything poor and nothing of it where the paper has it
         rho = np.full(48, 0.8 if name in ("duty_cycle_50", "prior_x10") else 0.1)

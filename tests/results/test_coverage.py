@@ -59,8 +59,7 @@ def ensemble():
     """Coverage of 80 skies drawn from a prior, each seen through the same noisy instrument:
     textbook formulas."""
     rng = np.random.default_rng(3)
-    ell = np.repeat(np.arange(LMAX + 1), 2 * np.arange(LMAX + 1) + 1)
-    prior = 3.0 / (1.0 + ell)
+    prior = 3.0 / (1.0 + np.repeat(np.arange(LMAX + 1), 2 * np.arange(LMAX + 1) + 1))
     # data that know the north better than the south, and large scales better than small ones
     y = pixel_matrix(4, LMAX)
     a = y[np.arange(len(y)) < len(y) // 3] / 0.2
@@ -108,8 +107,7 @@ def test_skies_of_the_prior_are_covered_within_the_printed_errors(tmp_path):
         sky[0] = setup.sky.modes[0]
         path = write_alms(tmp_path / f"{seed}.fits", sky, {})
         made, channel = mapped(under_sky(setup, FileSkySection(file=str(path)), seed))
-        drawn = made.compared()
-        error = channel.truth - channel.mean
+        drawn, error = made.compared(), channel.truth - channel.mean
         for factor, found in far.items():
             pixels = Counts.of_pixels(factor * channel.pixel_std, error, drawn).coverage()
             found.append((pixels[-1].held[1] - LEVELS[1]) / pixels[-1].scatter[1])

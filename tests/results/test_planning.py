@@ -184,8 +184,7 @@ def test_default_variations_compare_like_with_like():
 
 
 def test_what_is_there_twice_is_computed_once(monkeypatch, tmp_path):
-    computed = []
-    whole = varied()
+    computed, whole = [], varied()
     first = plan_run.forecast(whole)
     monkeypatch.setattr(
         "lusee_bayes.runs.plan_run.forecast",

@@ -270,8 +270,7 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns(
     prior = channels.joint.prior
     stds = [np.sqrt(np.asarray(per_mode(c))) for c in (prior.spectra[0], *prior.residual)]
     stds = np.concatenate([*stds, np.ones(3 * N_OWN)])
-    dense = DenseChannels.of(scenario)
-    unmixed = np.eye(len(stds))
+    dense, unmixed = DenseChannels.of(scenario), np.eye(len(stds))
     for port in range(4 * N_MODES, 4 * N_MODES + N_PORTS if smooth else 0):
         unmixed[port::N_OWN, port::N_OWN] = np.linalg.cholesky(
             ties(np.asarray(prior.frequencies_mhz))

@@ -111,8 +111,7 @@ def test_from_the_command_line(tmp_path, capsys, monkeypatch):
     assert run("simulate", "fiducial", *SMALL, *second, "-o", "b.nc", "-q") == 0
     mapped = ("map", "fiducial", *SMALL, "-q")
     assert run(*mapped, "--data", "a.nc", "--information", "-o", "first") == 0
-    add = ("--add", "first", "--information", "-o", "both")
-    assert run(*mapped, "--data", "b.nc", *add) == 0
+    assert run(*mapped, "--data", "b.nc", *("--add", "first", "--information", "-o", "both")) == 0
     assert run(*mapped, "--data", "a.nc", "-o", "plain") == 0
     scenario = lb.load_scenario("fiducial", list(SMALL[1::2]))
     files = (information_file(tmp_path / name) for name in ("both", "first"))
@@ -124,9 +123,9 @@ def test_from_the_command_line(tmp_path, capsys, monkeypatch):
     bits = [float(one.information.posterior(prior).information_bits()) for one in (saved, before)]
     assert bits[0] > bits[1] + 10
     for arguments, message in (
-        (("--data", "b.nc", "--add", "both"), "would count twice"),
+        (("--data", "b.nc", "--add", "both"), "already includes these data; give only new ones"),
         (("--add", "none"), "no posterior of lusee-bayes map --information at"),
-        (("--add", "plain"), "does not contain the information of its data; make that map again"),
+        (("--add", "plain"), "lacks the information of its data; make that map again"),
         (("--add", "both", "--set", "frequency_mhz=10"), "is for 25 MHz, the scenario for 10 MHz"),
         (("--add", "both", "--set", "lmax=4"), "has lmax = 5, the scenario lmax = 4; use"),
         (("--add", "both", "--frequencies", "10,20"), "no channel .*: 10 MHz: .* is for 25 MHz"),

@@ -45,8 +45,7 @@ def test_what_is_lost_is_small_and_grows_with_the_square_of_the_length(path, tmp
 
 
 def test_the_command_writes_averages_and_says_what_they_cost(path, tmp_path, capsys):
-    out = tmp_path / "averaged.nc"
-    given = ["--set", f"lmax={LMAX}"]
+    out, given = tmp_path / "averaged.nc", ["--set", f"lmax={LMAX}"]
     assert run("average", path, "--to", "2h", "-o", out, *given) == 0
     said = capsys.readouterr().out
     assert "39 samples of 1800 s -> 10 of 7200 s" in said
@@ -89,9 +88,9 @@ def test_average_s_of_the_scenario_does_not_count(path, data, tmp_path):
 
 
 BAD_INPUT = [
-    (["--to", "2hours"], "'2hours' is not a duration; give a positive number"),
+    (["--to", "2hours"], "'2hours' is not a duration; give one such as 30s"),
     (["--to", "10min"], "shorter than the samples (1800 s)"),
-    (["--to", "2h", "-o", "w.fits"], "give -o a name that does not end in .fits"),
+    (["--to", "2h", "-o", "w.fits"], "give -o a name without .fits"),
     (["--to", "2h", "-o", "data.nc"], "data.nc' is an input of this run"),
     (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25 MHz"),
     (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages have one frequency"),

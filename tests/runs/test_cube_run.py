@@ -75,8 +75,7 @@ def test_runs_take_names_strings_and_data_in_memory(tmp_path, monkeypatch, numbe
     """A cube of sets in memory is that of the same data simulated; ~ is the user's folder."""
     monkeypatch.setenv("HOME", str(tmp_path))
     scenario = three("noise.radiometer.temperature=model", frequencies="[20, 25]")
-    sets = channels_of(scenario)
-    file = tmp_path / "three.yaml"
+    sets, file = channels_of(scenario), tmp_path / "three.yaml"
     file.write_text(scenario.to_yaml())
     here = lb.run_map("~/three.yaml", "~/memory", data=sets, truth=True)
     assert here.folder == tmp_path / "memory"

@@ -97,7 +97,7 @@ def test_files_are_replaced_only_if_it_is_asked_for(simulated, tmp_path, capsys)
     out, session = tmp_path / "out.nc", simulated / "session_000.h5"
     before = session.read_bytes()
     again = ("simulate", "fiducial", "--flight", "-q", "-o", simulated, *given())
-    told = f"'{simulated}' already contains sessions (session_000.h5); give -o another folder, or"
+    told = f"'{simulated}' already contains sessions (session_000.h5); give another -o, or"
     assert told in refused(capsys, *again)
     assert session.read_bytes() == before
     for command in (
@@ -196,8 +196,7 @@ def test_a_clock_that_the_sessions_do_not_say_is_told_in_one_line(of_two_bands, 
     # nothing to say where the session says it itself
     known = lb.load_scenario("fiducial", [*TWO_BANDS, "flight.simulated.clock=known"])
     made = run_simulate_flight(known, tmp_path)
-    clock = f"flight.clock={of_two_bands[0].flight.clock}"
-    for given in ((), (clock,)):
+    for given in ((), (f"flight.clock={of_two_bands[0].flight.clock}",)):
         both = reduce_files(list(made.sessions), lb.load_scenario(str(made.scenario), given))
         assert both.notes() == ()
 

@@ -182,8 +182,7 @@ def test_a_kill_at_any_moment(command, with_earlier, number, tmp_path):
     it, earlier = command[0], command[1] if with_earlier else None
     folder = prepared(tmp_path, "run", earlier)
     # each in its own part of the run
-    random_part = random.Random(f"{it.name} {with_earlier} {number}").random()
-    moment = (number + random_part) / MOMENTS
+    moment = (number + random.Random(f"{it.name} {with_earlier} {number}").random()) / MOMENTS
     returncode = it.killed(folder, moment)
     assert returncode in (0, -signal.SIGKILL)
     state = state_of(folder, it, earlier)

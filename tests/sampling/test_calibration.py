@@ -50,8 +50,7 @@ def assert_calibrated(ranks: validation.Ranks) -> None:
 
 
 def ranks_of(*columns, regions=()) -> validation.Ranks:
-    names = tuple("abcdefgh"[: len(columns)])
-    return validation.Ranks(np.stack(columns, axis=1), names, regions)
+    return validation.Ranks(np.stack(columns, axis=1), tuple("abcdefgh"[: len(columns)]), regions)
 
 
 def test_the_histogram_has_twenty_bins_of_five_ranks():
@@ -93,8 +92,7 @@ def test_the_band_holds_a_bin_with_its_probability(n, probability):
 
 def test_p_values_are_those_of_chi2_of_the_histogram():
     rng = np.random.default_rng(1)
-    columns = [rng.integers(0, 100, 500), rng.binomial(99, 0.5, 500), np.arange(500) % 100]
-    ranks = ranks_of(*columns)
+    ranks = ranks_of(*[rng.integers(0, 100, 500), rng.binomial(99, 0.5, 500), np.arange(500) % 100])
     chi2 = ((ranks.histogram() - 25.0) ** 2 / 25.0).sum(1)
     np.testing.assert_allclose(ranks.p_values(), stats.chi2.sf(chi2, 19), rtol=1e-10)
     assert ranks.p_values()[1] < 1e-100 and ranks.p_values()[2] == 1.0

@@ -21,8 +21,7 @@ def log_integral(log_p, *nodes) -> float:
     """Of exp(log_p) over a regular grid, which is exact for smooth densities well inside."""
     weights = np.exp(log_p - log_p.max())
     for axis in range(weights.ndim):
-        edges = weights.take([0, -1], axis=axis)
-        assert edges.sum() < 1e-5 * weights.sum()
+        assert weights.take([0, -1], axis=axis).sum() < 1e-5 * weights.sum()
     return float(log_p.max() + np.log(weights.sum() * np.prod([x[1] - x[0] for x in nodes])))
 
 
@@ -110,8 +109,7 @@ def test_the_mode_and_the_curvature_in_two_dimensions():
     it = evidence("prior_amplitude").laplace
     names = [name for name, _ in it.whitening.sites]
     order = [names.index("amplitude"), names.index("tilt")]
-    mode = np.asarray(it.whitening.mean)[order]
-    h = 1e-3
+    mode, h = np.asarray(it.whitening.mean)[order], 1e-3
 
     def p(*off):
         return log_spectrum(*(mode + h * np.asarray(off)))

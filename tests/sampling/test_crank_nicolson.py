@@ -67,4 +67,4 @@ def test_every_turn_is_taken_where_the_coordinates_are_the_posteriors():
 
 
 def test_turns_need_white_coordinates():
-    refuse("found none; use nuts", drawn, None)
+    refuse("found no coordinates.*use nuts", drawn, None)

@@ -62,8 +62,7 @@ def test_weights_are_means_given_the_residuals(case):
     """E[w_t] by quadrature: w ~ Gamma(nu / 2, nu / 2), d_t ~ N(loc_t, N_t / w)."""
     nu, dense = 3.0, np.asarray(case.noise.dense())
     found = TimesStudentT(case.loc, case.noise, case.layout, nu).weights(case.value)
-    w = np.exp(np.linspace(-25.0, 5.0, 4001))
-    expected = np.ones(N_TIMES)
+    w, expected = np.exp(np.linspace(-25.0, 5.0, 4001)), np.ones(N_TIMES)
     for t, at, _ in by_time(case, nu):
         residual = np.asarray(case.value - case.loc)[at]
         chi2 = residual @ np.linalg.solve(dense[np.ix_(at, at)], residual)
@@ -93,8 +92,7 @@ def test_draws_follow_their_law(case):
     draws = site.sample(jax.random.key(3), (2, n // 2))
     assert draws.shape == (2, n // 2, case.layout.size)
     away = np.asarray(draws).reshape(n, -1) - np.asarray(case.loc)
-    dense = np.asarray(case.noise.dense())
-    chi2 = []
+    dense, chi2 = np.asarray(case.noise.dense()), []
     for _, at, law in by_time(case, nu):
         precise = np.linalg.inv(law.shape) if len(at) > 1 else 1.0 / dense[np.ix_(at, at)]
         chi2.append(np.einsum("na,ab,nb->n", away[:, at], precise, away[:, at]) / len(at))

@@ -68,8 +68,7 @@ class Truth:
 def wrong_posterior(mean: np.ndarray, covariance: np.ndarray) -> Posterior:
     """N(mean, covariance), whatever they are: the prior is one, Lambda the covariance's inverse."""
     lower = np.linalg.cholesky(np.linalg.inv(covariance))
-    prior = lb.HarmonicPrior(jnp.ones(LMAX + 1))
-    zero = jnp.zeros(())
+    prior, zero = lb.HarmonicPrior(jnp.ones(LMAX + 1)), jnp.zeros(())
     return Posterior(prior, jnp.asarray(mean), jnp.asarray(lower), None, zero, zero)
 
 

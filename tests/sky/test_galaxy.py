@@ -121,10 +121,9 @@ def test_mean_temperature_and_pattern_are_ulsas(ulsa_map, frequency_mhz, floor):
 def test_without_electrons_the_integral_is_quads(lon_deg, lat_deg):
     # Three Gauss points per panel leave 1e-6; 1e-4 within 0.3 kpc of the cusp at the centre.
     got, depth = one_line(lon_deg, lat_deg, 25.0, electrons=0.0)
-    edges = [0.0, 0.5, 2.0, 8.0, 8.5, 9.0, 17.0, 50.0]
     want = sum(
         quad(emissivity, a, b, args=(lon_deg, lat_deg, 25.0), epsabs=0.0, epsrel=1e-10)[0]
-        for a, b in itertools.pairwise(edges)
+        for a, b in itertools.pairwise([0.0, 0.5, 2.0, 8.0, 8.5, 9.0, 17.0, 50.0])
     )
     assert got == pytest.approx(want, rel=1e-4 if lon_deg < 1.0 else 1e-6)
     assert depth == 0.0

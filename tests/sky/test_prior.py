@@ -87,7 +87,7 @@ def test_the_contract_notices_a_wrong_prior():
 
 def test_what_no_prior_is_is_refused():
     dense, harmonic, root = DensePrior, lb.HarmonicPrior, np.linalg.cholesky(dense_covariance())
-    refuse("lower triangular.*positive diagonal", dense, dense_covariance())
+    refuse("Cholesky factor: lower triangular, diagonal > 0", dense, dense_covariance())
     refuse("the prior mean has shape", dense, root, mean=np.zeros(9))
     refuse("the root of the prior.*NaN", dense, np.full((4, 4), np.nan))
     refuse(r"negative.*ell = 2.*C_ell = -0\.5", harmonic, jnp.array([1.0, 1.0, -0.5, -1.0]))
@@ -130,7 +130,7 @@ def test_a_dense_prior_of_any_root():
         np.testing.assert_array_equal(prior.root, np.tril(prior.root))
         np.testing.assert_allclose(prior.covariance(), root @ root.T, rtol=1e-9)
         np.testing.assert_array_equal(prior.mean, np.arange(6.0))
-    refuse("positive diagonal", DensePrior.of_root, np.zeros((3, 3)))
+    refuse("diagonal > 0", DensePrior.of_root, np.zeros((3, 3)))
 
 
 def test_residuals_are_those_of_the_data_less_the_mean(small_experiment):

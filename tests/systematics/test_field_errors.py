@@ -60,8 +60,7 @@ def test_beams_are_those_of_fields_with_errors():
     grid = HemisphereGrid.gauss_legendre(48, 48)
     theta, phi = (x.ravel() for x in np.meshgrid(grid.theta, grid.phi, indexing="ij"))
     of_ells = [values[f"field_error_{k}"].reshape(2, 4, 2, 2 * k + 1) for k in range(3)]
-    modes = np.concatenate(of_ells, axis=3)
-    real, imaginary = modes @ real_harmonics(theta, phi, 2).T
+    real, imaginary = np.concatenate(of_ells, axis=3) @ real_harmonics(theta, phi, 2).T
     fields = setup.beam_source.fields(setup.frequency_mhz, grid)
     power = np.abs(np.asarray(fields.e_theta)) ** 2 + np.abs(np.asarray(fields.e_phi)) ** 2
     weights = grid.weights[:, None] / grid.n_phi  # of means over the hemisphere

@@ -78,8 +78,7 @@ def test_marginalised_they_are_the_closed_form(warm, response_file):
 
 
 def test_the_mean_receiver_sets_the_noise_and_the_offset(warm, response_file):
-    bare = set_up(four_ports(response_file))
-    setup = warm.setup
+    bare, setup = set_up(four_ports(response_file)), warm.setup
     added = np.asarray(setup.signal) - np.asarray(bare.signal)
     np.testing.assert_allclose(added[AUTOS], 2000.0, rtol=1e-9)
     np.testing.assert_allclose(np.delete(added, AUTOS, axis=0), 0.0, atol=1e-9)
@@ -390,8 +389,7 @@ def test_sampled_the_density_is_the_closed_form(response_file):
     """Factors by hand on the rows of A and on the offset."""
     e = lb.build(four_ports(response_file, TABLE % "sampled"))
     setup, z = e.setup, np.array([0.5, -1.5, 0.2, 1.1])
-    values = {"gain_table": z}
-    factors = per_port(z)
+    values, factors = {"gain_table": z}, per_port(z)
     a, prior, noise = parts(setup)
     a = factors[:, None] * a
     rest = np.asarray(e.data.data) - factors * np.asarray(setup.offset)

@@ -222,8 +222,7 @@ def test_marginalised_and_sampled_are_one_distribution(model, term):
 
     with handlers.seed(rng_seed=0), handlers.trace() as trace:
         term.sampled(model)
-    fn = trace[f"{term.name}_noise"]["fn"]
-    z = jnp.arange(float(rank))
+    fn, z = trace[f"{term.name}_noise"]["fn"], jnp.arange(float(rank))
     expected = -0.5 * (z**2).sum() - 0.5 * rank * np.log(2.0 * np.pi)
     assert float(fn.log_prob(z)) == pytest.approx(float(expected), rel=1e-13)
     root = np.asarray(jax.jit(jax.jacfwd(offset))(jnp.zeros(rank)))

@@ -71,8 +71,7 @@ def test_white_noise_makes_drifts_of_the_right_covariance():
         # a margin for 10 hours cuts off longer ones at exp(-(60 / t)^2 2)
         root = np.asarray(drift.history(jnp.eye(drifts.grid.shape[0]), hours, drifts.grid))
         expected = 4e-4 * np.exp(-0.5 * ((hours[:, None] - hours) / correlation_h) ** 2)
-        cut = np.exp(-2 * (60.0 / correlation_h) ** 2)
-        within(root.T @ root, expected, 4e-4 * (1e-14 + cut))
+        within(root.T @ root, expected, 4e-4 * (1e-14 + np.exp(-2 * (60.0 / correlation_h) ** 2)))
 
 
 def test_sampled_gains_multiply_what_n_holds_and_drifts_stay_in_it():
@@ -153,8 +152,7 @@ def test_a_map_with_found_drifts_is_that_of_hmc(tmp_path):
         sampled, tmp_path / "run", sampler=lb.Sampler(chains=2, warmup=300, draws=600)
     ).result
     sky = drawn[0].tree["posterior"]["sky"].values.reshape(-1, 25)
-    off = (np.asarray(posterior.mean) - sky.mean(0)) / sky.std(0)
-    assert np.abs(off).max() < 0.2
+    assert np.abs((np.asarray(posterior.mean) - sky.mean(0)) / sky.std(0)).max() < 0.2
     within(np.sqrt(np.diag(np.asarray(posterior.covariance()))) / sky.std(0), 1.0, 0.15)
 
 

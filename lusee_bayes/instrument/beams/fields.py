@@ -282,8 +282,7 @@ def on_grid(rows: Pattern, theta: Angles, grid: HemisphereGrid, angle_deg: float
     steps = angle_deg * n / 360.0
     if grid.n_phi == n and steps == round(steps):
         return np.roll(rows, round(steps), axis=1)
-    m = np.fft.fftfreq(n, 1.0 / n)
-    spectrum = np.fft.fft(rows, axis=1) / n
+    m, spectrum = np.fft.fftfreq(n, 1.0 / n), np.fft.fft(rows, axis=1) / n
     return spectrum @ np.exp(1j * m[:, None] * (grid.phi - np.radians(angle_deg))[None])
 
 

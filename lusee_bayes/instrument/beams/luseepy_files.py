@@ -389,8 +389,7 @@ def read_response(path: str | Path) -> PortResponse:
     for name, degrees, last in (("theta", theta_deg, 90.0), ("phi", phi_deg, 360.0)):
         if not np.allclose(degrees, np.linspace(0.0, last, len(degrees)), rtol=0, atol=1e-9):
             raise InputError(
-                f"{path}: {name} goes from {degrees[0]:g} to {degrees[-1]:g} degrees; expected "
-                f"equal steps from 0 to {last:g}"
+                f"{path}: {name} goes {degrees[0]:g} to {degrees[-1]:g}, expected 0 to {last:g}"
             )
     complex_ = {n: images[f"{n}_real"] + 1j * images[f"{n}_imag"] for n in (*LENGTHS, *MATRICES)}
     # the last azimuth repeats the first

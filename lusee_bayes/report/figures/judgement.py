@@ -37,8 +37,7 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     x, y = np.arange(len(hours) + 1) - 0.5, np.arange(len(labels) + 1) - 0.5
     widest = max(WIDEST, float(np.nanpercentile(np.abs(z), 98)))
     style = {"cmap": drawing.DIVERGING, "norm": Normalize(-widest, widest), "rasterized": True}
-    image = left.pcolormesh(x, y, z, **style)
-    days = np.asarray(hours) / 24.0
+    image, days = left.pcolormesh(x, y, z, **style), np.asarray(hours) / 24.0
     ticks = MaxNLocator(7).tick_values(days[0], days[-1])
     ticks = ticks[(ticks >= days[0]) & (ticks <= days[-1])]
     left.set_xticks(np.searchsorted(days, ticks), [f"{day:g}" for day in ticks])
