@@ -108,7 +108,7 @@ class Observation(checks.Described):
             return
         if self.fixed_axis:
             raise InputError(
-                "a fixed axis of the Moon needs samples that are instants; use observation.window=instant"
+                "a fixed lunar axis needs samples that are instants; use observation.window=instant"
             )
         self.windows.require_fitting(self.times, self.step_s)
 

@@ -158,7 +158,7 @@ def test_names_of_files_keep_their_capitals():
 def test_info_recognises_files_and_folders(small_map, folder, tmp_path, capsys):
     run("simulate", "fiducial", *SMALL, "-o", tmp_path / "data.nc", "-q")
     (days,) = {len(c.judged.of_kind("day")) for c in small_map.result.channels}
-    simulated = "results of map, sample", "simulated by this run, seed 1"
+    simulated = "results of lusee-bayes map", "simulated by this run, seed 1"
     for path, words in [
         (tmp_path / "data.nc", ["Visibilities: 16 products x"]),
         (folder / "posterior.nc", ["posterior over 81 modes"]),

@@ -195,7 +195,7 @@ def test_bins_of_which_nothing_remains_are_dropped():
     # no product is there for half of the time, or none with another
     rarely = flagged(*((p, k) for p in range(16) for k in range(4) if p % 4 != k))
     for data in (rarely, flagged(*((p, k) for p in range(16) for k in range(4) if p % 2 != k % 2))):
-        refuse("averaging.*2400 s.*no data", averaged, data, 4 * STEP)
+        refuse("averages.*2400 s.*no data", averaged, data, 4 * STEP)
 
 
 NOT_AVERAGED = [
@@ -492,7 +492,7 @@ NOT_OF_A_FILE = [
     (lose("piece_end_s"), "piece_sample without piece_end_s"),
     (bounds_alone(lose("time_bounds")), "live_time without time_bounds"),
     (bounds_alone(lose("time_bounds", "live_time")), "window = 'mean' without time_bounds"),
-    (attribute("window", "instant"), "declares the samples instants, but piece_sample"),
+    (attribute("window", "instant"), "declares instants, but piece_sample"),
     (attribute("window", "means"), "window is 'means'; did you mean 'mean'"),
     (shifted_bounds, "time_bounds and the pieces of sample 0 differ by 30 s"),
     (changed("piece_start_s", np.nan), "piece_start_s.*NaN"),
