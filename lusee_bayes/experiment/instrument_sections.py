@@ -106,7 +106,7 @@ class ObservationSection(Section):
         for name in ("start", "runs"):
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(
-                    f"schedule {self.schedule} and {name} both set observing times; remove one"
+                    f"schedule {self.schedule} and {name} both set the observing times; remove one"
                 )
         return self
 
