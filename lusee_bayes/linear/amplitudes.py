@@ -161,7 +161,7 @@ class AmplitudesOfSky:
             solved, covariance = factor.base.whiten_transpose(half), left[at]
             residual = solution.data - model.predict(solution.posterior.mean)
             # T^T N^-1 r would lose the digits that the data add to a wide prior
-            mean = half.T @ np.asarray(factor.base.whiten(np.asarray(residual)))
+            mean = np.asarray(half).T @ np.asarray(factor.base.whiten(np.asarray(residual)))
         else:
             solved = np.asarray(factor.solve(t))
             covariance = np.eye(t.shape[1]) - t.T @ solved
