@@ -102,7 +102,8 @@ def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
         raise
     except Exception as error:
         raise InputError(
-            f"{path} cannot be read as {what}: {_reason(error)}; it is truncated or damaged"
+            f"{path} cannot be read as {what}: {_reason(error)}; it is truncated, damaged, or of "
+            "another kind"
         ) from error
 
 

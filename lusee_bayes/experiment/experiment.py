@@ -254,7 +254,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     def require_free(cls: type[Systematic]) -> None:
         if cls.treatment(experiment.scenario) == "marginalised":
             raise InputError(
-                f"what it samples the scenario marginalises, too; set {cls.key}.treatment=sampled"
+                f"the scenario marginalises this unknown, too; set {cls.key}.treatment=sampled"
             )
 
     def built(cls: type[Systematic]) -> Systematic:

@@ -263,7 +263,7 @@ def reach(experiment: Experiment, inference: Inference) -> list[str]:
         sentences.append(
             f"The posterior of {keys} is not Gaussian (Pareto k = {k:.2g}, accepted: "
             f"{LARGEST_K:g}). Terms beyond first order move the map by {moved_by:.2g} of its "
-            f"standard deviations (rms), so that {holds}; treatment=sampled is not approximate."
+            f"standard deviations (rms), so that {holds}; treatment=sampled needs no Gaussian."
         )
     if setup.measured:
         spots = blind_spots(setup, inference, inference.posterior.mean, pointing=False)

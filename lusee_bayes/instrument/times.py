@@ -155,7 +155,7 @@ def _as_text(number: int, one: Any) -> str:
         one = (one.astimezone(UTC).replace(tzinfo=None) if one.tzinfo else one).isoformat()
     if not isinstance(one, str):
         raise InputError(
-            f"time {number} is {one!r}, a {type(one).__name__}; give datetimes or an astropy Time"
+            f"time {number} is {one!r}, a {type(one).__name__}; give datetimes, ISO dates or a Time"
         )
     # astropy does not accept ISO's Z for UTC
     return one.removesuffix("Z")

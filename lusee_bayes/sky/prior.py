@@ -341,7 +341,8 @@ class HarmonicPrior(DiagonalPrior):
         fixed = np.flatnonzero((np.asarray(self.mean) != 0.0) & ~(np.asarray(self.variance()) > 0))
         if fixed.size:
             raise InputError(
-                f"the prior mean has power at ell = {int(np.sqrt(fixed[0]))}, where C_ell is zero"
+                f"the prior mean has power at ell = {int(np.sqrt(fixed[0]))}, where C_ell is zero; "
+                "give that ell a variance"
             )
 
     def description(self) -> tuple[str, ...]:

@@ -175,7 +175,7 @@ class GainDrifts(Systematic):
         if PER_CORRELATION * (hours[-1] - hours[0]) > MOST_POINTS * ends[0]:
             raise InputError(
                 f"noise.gain.correlation_h is {ends[0]:.3g} h at least, too short for "
-                f"{hours[-1] - hours[0]:.4g} h of data; such gains are noise: noise.radiometer"
+                f"{hours[-1] - hours[0]:.4g} h of data; use noise.radiometer.factor"
             )
         grid = white_grid(hours, *ends, per_correlation=PER_CORRELATION, margin=MARGIN)
         widths, stds = (drift.width(hours), longest.width(hours)), (log_sigma_std, log_std)

@@ -106,7 +106,7 @@ class GainTable(Systematic):
                     )
             if std is None:
                 raise InputError(
-                    "the data contain no gain table; give noise.gain_table.std, of each power gain"
+                    "the data contain no gain table; give noise.gain_table.std, a relative error"
                 )
             n_ports = setup.beam_source.n_ports
             slope = np.full((n_ports, setup.layout.n_times), std)
