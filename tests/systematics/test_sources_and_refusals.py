@@ -272,12 +272,7 @@ def test_nothing_is_counted_twice(program, overrides, section):
     """What a program samples must not be in N as well."""
     asked = lb.load_program(program)
     e = experiment(*overrides, sources=CAS_A)
-    refuse(
-        f"this unknown, too; set {section}.treatment=sampled",
-        program_arguments,
-        asked,
-        e,
-    )
+    refuse(f"this unknown, too; set {section}.treatment=sampled", program_arguments, asked, e)
     # either of the other treatments will do
     for treatment in ("sampled", "ignored"):
         free = experiment(*overrides, f"{section}.treatment={treatment}", sources=CAS_A)
