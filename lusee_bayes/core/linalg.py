@@ -46,14 +46,14 @@ def _routine(name: str) -> Callable[..., None]:
     return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * declared.count(b"*"))(address)
 
 
-def _called(name: str, *arguments: bytes | int | float | np.ndarray) -> int:
+def _called(name: str, *arguments: bytes | int | float | np.ndarray | ctypes.Array) -> int:
     """Call a routine with all arguments except info, and return info; arrays are overwritten."""
     routine, info, pointers = _routine(name), ctypes.c_int(0), []
     for argument in arguments:
         if isinstance(argument, np.ndarray):
             require_float64("the matrix", argument)
             pointers.append(argument.ctypes.data)
-        elif isinstance(argument, bytes):
+        elif isinstance(argument, bytes | ctypes.Array):
             pointers.append(argument)
         else:
             kind = ctypes.c_int if isinstance(argument, int) else ctypes.c_double
@@ -74,6 +74,9 @@ PERMUTED = 64
 
 # error of combinations of a few rows of a matrix, relative to its largest row
 SPANNED = 1e-12
+
+# share of the trace to be left out, for columns of a matrix that are not considered
+SCREENED = 0.01
 
 
 def cholesky(matrix: Matrices, *, overwrite: bool = False) -> Matrices:
@@ -300,6 +303,21 @@ def spanning_rows(
         residual -= along[-1][:, None] * unit
     coordinates = np.stack(along, axis=1)
     return np.array(picked), np.linalg.solve(coordinates[picked].T, coordinates.T).T
+
+
+def main_directions(matrix: Matrix, left_out: float) -> Float[np.ndarray, "n few"]:
+    """Return the fewest orthonormal directions X for which tr(M - M X X^T) < ``left_out``.
+
+    They are eigenvectors of a positive semidefinite M, found among the few columns of its pivoted
+    Cholesky factor: all others together have at most ``SCREENED`` of ``left_out``.
+    """
+    n, lower = len(matrix), np.array(matrix, order="C")
+    pivots, rank = (ctypes.c_int * n)(), (ctypes.c_int * 1)()
+    _called("dpstrf", b"U", n, lower, n, pivots, rank, SCREENED * left_out / n, np.empty(2 * n))
+    basis, triangle = np.linalg.qr(np.tril(lower[:, : rank[0]])[np.argsort(pivots)])
+    squares, directions = np.linalg.eigh(triangle @ triangle.T)
+    without = np.trace(matrix) - squares.sum() + np.cumsum(squares)
+    return basis @ directions[:, np.searchsorted(without, left_out) :]
 
 
 def mirrored(lower: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:

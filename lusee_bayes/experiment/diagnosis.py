@@ -406,6 +406,8 @@ SCREENED_LMAX = 12
 TRIED, PROMISING = 3, 0.1
 # if nothing makes the data fit, list mistakes that leave less than this fraction of the excess
 EXPLAINED = 0.03
+# a smaller chi^2 per degree of freedom means that without the mistake N would be far too large
+LEAST = 0.5
 # any mistake must reduce the excess by more than this number of standard deviations
 SIGNIFICANT = 10.0
 # mistakes are indistinguishable for these antennas if their chi^2 differ by less, relative
@@ -443,7 +445,12 @@ class Proposal:
         """Whether chi^2 fits without the mistake, and is much closer to its expected value."""
         free = max(before.degrees - self.chi2.degrees, 1.0)
         gained = abs(before.chi2 - before.degrees) - self.excess
-        return self.chi2.fits and gained > SIGNIFICANT * (2.0 * free) ** 0.5
+        return self.explains and gained > SIGNIFICANT * (2.0 * free) ** 0.5
+
+    @property
+    def explains(self) -> bool:
+        """Whether chi^2 fits, or is smaller, e.g. for simulations without what N allows for."""
+        return self.chi2.fits or LEAST * self.chi2.degrees < self.chi2.chi2 < self.chi2.degrees
 
 
 @dataclass(frozen=True)
@@ -476,7 +483,7 @@ class Diagnosis:
             return [f"As a whole, the data fit without assuming a mistake ({self.chi2.words()})."]
         if not self.proposals:
             return [f"None of the {self.n_tried} usual mistakes explains the misfit."]
-        first = "Did you mean" if self.proposals[0].chi2.fits else "Closest, but not enough"
+        first = "Did you mean" if self.proposals[0].explains else "Closest, but not enough"
         return [f"{first}:"] + [
             f"({number}) {one.words}: {one.remedy} ({one.chi2.words()})."
             for number, one in enumerate(self.proposals, 1)

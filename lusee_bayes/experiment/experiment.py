@@ -82,10 +82,6 @@ class Experiment(Described):
         return self.setup.scenario
 
 
-# largest matrix of data and modes above lmax, in numbers: 4 GB
-MOST_ABOVE = 5e8
-
-
 def build(
     scenario: Scenario,
     data: Visibilities | None = None,
@@ -140,12 +136,6 @@ def observed(
         data = data.with_truth_up_to(scenario.lmax)
     scenario = scenario.with_section("noise", above_lmax=above)
     try:
-        if above is not None:
-            n_data, top = data.layout.size, above.top(scenario.lmax)
-            if n_data * n_modes(top) > MOST_ABOVE:
-                raise InputError(
-                    f"{n_data:,} data up to lmax = {top} need too much memory; average the data"
-                )
         setup = set_up(scenario, data, stages)
     except InputError as error:
         if above is None:

@@ -104,7 +104,8 @@ def set_up(
         setup = Setup(scenario, *pieces, **of_data, family=family)
     horizon = scenario.noise.horizon
     setup = setup if horizon is None else Horizon.moved(horizon, setup, {})
-    return with_sky_above(setup.with_signal())
+    with stages("sky above lmax"):
+        return with_sky_above(setup.with_signal())
 
 
 def with_sky_above(
@@ -122,8 +123,8 @@ def with_sky_above(
     """
     if AboveLmax.treatment(setup.scenario) is None:
         return setup
-    noise, coupling = on_host(radiometer(setup)).factor(), _coupling_above(setup, values or {})
-    return replace(setup, above=sky_above(setup, coupling, noise, covariance))
+    coupling = _coupling_above(setup, values or {})
+    return replace(setup, above=sky_above(setup, coupling, radiometer(setup), covariance))
 
 
 def _coupling_above(setup: Setup, values: Truth) -> CouplingMatrix:

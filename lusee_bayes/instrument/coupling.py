@@ -46,8 +46,8 @@ BodyBeams = Float[Array, "runs products functions modes"]
 RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
 Factors = Float[Array, "functions powers orders 2"]
-# times that A^T d processes at once, which bounds the memory
-MOST_TIMES = 8192
+# times that A^T d processes at once, for one column of d, and for many; this bounds the memory
+MOST_TIMES, FEWEST_TIMES = 8192, 256
 
 
 class Coupling(Described, eqx.Module):
@@ -488,7 +488,7 @@ class CouplingMatrix(Coupling):
         functions = self.pointing.functions
         n_products, n_functions = self.body_beams.shape[1:3]
         xp, both = namespace(grid, functions), 0.0
-        for run, part in self._parts():
+        for run, part in self._parts(grid.shape[-1]):
             over_time = grid[:, part].swapaxes(0, 1).reshape(part.stop - part.start, -1)
             waves = []
             for wave in _phases(self.pointing.azimuth[part], self.lmax):
@@ -503,13 +503,14 @@ class CouplingMatrix(Coupling):
         plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
         ell, m = mode_numbers(self.lmax)
         packed = xp.where((m >= 0)[:, None], plus[np.abs(m), ell], minus[np.abs(m), ell])
-        return self.pointing.pole_from_galactic.T(packed.T).T.reshape(-1, *columns)
+        return self.pointing.pole_from_galactic.T(packed.T).T.reshape(self.shape[1], *columns)
 
-    def _parts(self) -> Iterator[tuple[int, slice]]:
+    def _parts(self, columns: int = 1) -> Iterator[tuple[int, slice]]:
         """Runs in parts of at most MOST_TIMES samples: number of the run, and its samples."""
+        step = max(MOST_TIMES // max(columns, 1), FEWEST_TIMES)
         for run, span in self.pointing.runs():
-            for first in range(span.start, span.stop, MOST_TIMES):
-                yield run, slice(first, min(first + MOST_TIMES, span.stop))
+            for first in range(span.start, span.stop, step):
+                yield run, slice(first, min(first + step, span.stop))
 
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""

@@ -374,10 +374,9 @@ class LeftOut:
 
     def _pull(self, x: Float[np.ndarray, "blocks places k"]) -> Float[np.ndarray, "rank k"]:
         """F^T x."""
-        coupling, prior = self._model.coupling, self._model.prior
-        columns = self._cells.gather(np.ascontiguousarray(x.swapaxes(0, 1)))
-        sky = np.reshape([coupling.transpose_mv(column) for column in columns.T], (-1, prior.size))
-        return np.concatenate([self._templates.T @ columns, prior.colour_columns(sky).T])
+        model, columns = self._model, self._cells.gather(np.ascontiguousarray(x.swapaxes(0, 1)))
+        sky = model.prior.colour_columns(model.coupling.transpose_mv(columns).T).T
+        return np.concatenate([self._templates.T @ columns, sky])
 
     def _gram(self, weights: Weights) -> Square:
         """F^T W F."""
@@ -387,8 +386,6 @@ class LeftOut:
             return rows[some].T @ weigh(weights, rows)[some]
         n, model = self._n_templates, self._model
         sky = model.prior.sandwich(summed(model.coupling, np.moveaxis(weights, 0, -1)))
-        if not n:
-            return sky
         across = self._pull(weigh(weights, self._t))
         return np.block([[across[:n], across[n:].T], [across[n:], sky]])
 

@@ -41,7 +41,7 @@ IN_ROUNDS, FIELD_ARRAYS = 3e5, 8
 # operations for comparing times of flight data, in n_data n^2
 COMPARING_OPERATIONS = 40
 # the sky above lmax: arrays of data, and floating-point operations in n_data n^2 + n^3
-ABOVE_ARRAYS, ABOVE_OPERATIONS = 4, 5
+ABOVE_ARRAYS, ABOVE_OPERATIONS = 1.5, 5
 # arrays of pixels for the maps of a report, intermediate results included
 MAPS = 12
 # arrays of data for each source in the model

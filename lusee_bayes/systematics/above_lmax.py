@@ -20,20 +20,23 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 import numpy as np
-from jaxtyping import Float
 from pydantic import Field
 
 from lusee_bayes.core.arrays import DataVector, ModesMatrix
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import LARGEST_LMAX
-from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, times_lower
+from lusee_bayes.core.linalg import checked_cholesky, main_directions, sandwich
 from lusee_bayes.core.section import Section, Treatment
 from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.noise.covariance import Factor
+from lusee_bayes.linear.normal_matrix import normal_matrix
+from lusee_bayes.noise.covariance import Covariance
 from lusee_bayes.systematics.context import Above, Around, Setup
 from lusee_bayes.systematics.systematic import LowRankNoise, with_added
 
 # largest change of chi^2 by all omitted directions together
 LEFT_OUT = 1.0
+# most numbers in its effect on the data: 4 GB
+MOST_NUMBERS = 5e8
 
 
 class AboveLmaxSection(Section):
@@ -98,7 +101,7 @@ class AboveLmax(LowRankNoise):
 
 
 def sky_above(
-    setup: Setup, coupling: CouplingMatrix, noise: Factor, learned: ModesMatrix | None = None
+    setup: Setup, coupling: CouplingMatrix, noise: Covariance, learned: ModesMatrix | None = None
 ) -> Above:
     """Compute the possible contribution of the sky above lmax to the data.
 
@@ -107,8 +110,8 @@ def sky_above(
     setup : Setup
     coupling : CouplingMatrix
         A of all modes up to the highest ell.
-    noise : Factor
-        Of the radiometer noise.
+    noise : Covariance
+        Of the radiometer.
     learned : (modes, modes) array, optional
         Prior covariance of all modes, learned from the data, in K^2; by default the expected one.
     """
@@ -126,24 +129,14 @@ def sky_above(
         covariance, mean = learned, family.mean
         if learned is None:
             covariance = family.at(family.hyperprior.start()).covariance
-    white = np.array(noise.whiten(np.asarray(coupling.dense())[:, n:]))
-    covariance = np.asarray(covariance)[n:, n:]
-    power = (white**2).sum(0) * np.diagonal(covariance)
+    covariance, seen = (np.asarray(x)[n:, n:] for x in (covariance, normal_matrix(coupling, noise)))
+    power = np.diagonal(seen) * np.diagonal(covariance)
     power = np.add.reduceat(power, np.arange(scenario.lmax + 1, lmax + 1) ** 2 - n)
     root = checked_cholesky("the prior above lmax", covariance)
-    white = times_lower(white, root, transpose=False)
-    directions = np.pad(root @ _main_directions(white), ((n, 0), (0, 0)))
+    directions = main_directions(sandwich(seen, root), LEFT_OUT)
+    if (n_data := noise.size) * directions.shape[1] > MOST_NUMBERS:
+        raise InputError(f"its effect on {n_data:,} data needs too much memory; average the data")
+    directions = np.pad(root @ directions, ((n, 0), (0, 0)))
     expected = np.zeros(len(directions)) if mean is None else np.array(mean)
     expected[:n] = 0.0
     return Above(coupling, modes, family, directions, expected, power)
-
-
-def _main_directions(white: Float[np.ndarray, "data modes"]) -> Float[np.ndarray, "modes few"]:
-    """The fewest orthonormal directions that leave less than LEFT_OUT of a matrix's squares."""
-    if many := len(white) >= white.shape[1]:
-        squares, directions = np.linalg.eigh(gram_matrix(white))
-    else:  # in a basis with no more directions than there are data
-        basis, triangle = np.linalg.qr(white.T)
-        squares, directions = np.linalg.eigh(triangle @ triangle.T)
-    few = directions[:, np.searchsorted(np.cumsum(squares), LEFT_OUT) :]
-    return few if many else basis @ few

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import lusee_bayes as lb
+from lusee_bayes.core.linalg import main_directions
 from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate, true_signal
 from lusee_bayes.systematics import above_lmax
 from lusee_bayes.systematics.context import prior_and_family
@@ -69,13 +70,13 @@ def test_beams_that_end_before_leave_a_map_and_a_doubt(monkeypatch):
     experiment = lb.build(own, data)
     assert experiment.setup.above is None and "72 azimuths" in experiment.doubts[0]
     monkeypatch.undo()
-    monkeypatch.setattr("lusee_bayes.experiment.experiment.MOST_ABOVE", 1e5)
+    monkeypatch.setattr("lusee_bayes.systematics.above_lmax.MOST_NUMBERS", 1e5)
     assert "too much memory" in lb.build(own, data).doubts[0]
 
 
 def test_main_directions_leave_out_as_little_as_singular_vectors():
-    white = np.random.default_rng(1).standard_normal((700, 600)) * np.geomspace(30.0, 1e-4, 600)
-    found = above_lmax._main_directions(white)
+    white = np.random.default_rng(1).standard_normal((500, 600)) * np.geomspace(30.0, 1e-4, 600)
+    found = main_directions(white.T @ white, 1.0)
     np.testing.assert_allclose(found.T @ found, np.eye(found.shape[1]), atol=1e-9)
     left = np.vdot(white, white) - np.vdot(white @ found, white @ found)
     beyond = np.cumsum(np.linalg.svd(white)[1][::-1] ** 2)
