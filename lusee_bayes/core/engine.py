@@ -41,8 +41,7 @@ Merge = Callable[[R, R], R]
 
 def processors() -> int:
     """The number of processors that this process may use."""
-    mine = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))
-    return len(mine(0))
+    return len(getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))(0))
 
 
 def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:

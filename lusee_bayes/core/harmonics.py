@@ -441,8 +441,7 @@ def tilts(modes: Fields, order: int) -> list[Fields]:
     terms = {(0, 0): modes}
     for a, b in tilt_powers(order)[1:]:
         left = apply_generator(terms[a - 1, b], 0) if a else 0.0
-        right = apply_generator(terms[a, b - 1], 1) if b else 0.0
-        terms[a, b] = left + right
+        terms[a, b] = left + (apply_generator(terms[a, b - 1], 1) if b else 0.0)
     return list(terms.values())
 
 

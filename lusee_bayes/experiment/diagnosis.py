@@ -228,8 +228,7 @@ class UnderAnySky:
         autos = auto_indices(setup.beam_source.n_ports)
         modelled = float(np.median(np.asarray(setup.signal)[autos]))
         brighter = np.nanmedian(np.append(np.asarray(data.grid())[autos], modelled)) / modelled
-        spectrum = mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
-        return cls(setup, data, model, spectrum)
+        return cls(setup, data, model, mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2)
 
     def wide(self, coupling: Coupling) -> tuple[ChiSquare, Solution]:
         """Residual chi^2, and the solution under the wide prior."""
@@ -255,8 +254,7 @@ class UnderAnySky:
     def without(self, mistake: DataMistake) -> ChiSquare:
         """Residual chi^2 of the data without a mistake, with N rebuilt for them."""
         layout = self.data.layout
-        right = np.asarray(layout.gather(mistake.undone(filled(self.data))))
-        data = replace(self.data, data=right)
+        data = replace(self.data, data=np.asarray(layout.gather(mistake.undone(filled(self.data)))))
         try:
             model = full_model(self.setup, Around(data))
         except InputError:  # undoing it makes some auto negative or zero

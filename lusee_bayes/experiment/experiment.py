@@ -36,6 +36,7 @@ from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
 from lusee_bayes.systematics.beam import BeamErrors
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities
+from lusee_bayes.systematics.field_errors import STD
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.sources import PointSources
@@ -324,6 +325,8 @@ def posterior_draws(
 
 # rms error of interpolated beams in the data, over radiometer noise, above which to warn
 MOST_OFF = 0.1
+# learned field errors that are larger than expected by this factor are reported
+LARGE = 10.0
 
 
 def interpolation_error(setup: Setup) -> dict[str, float]:
@@ -354,6 +357,12 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
             f"omitting the files of {worst}; use more files, in smaller steps."
         )
     setup = experiment.setup
+    std, stated = (inference.around.values or {}).get(STD, 0.0), setup.scenario.noise.fields
+    if stated is not None and std > LARGE * stated.std:
+        notes.append(
+            f"The data require field errors of {100.0 * std:.2g} %, {std / stated.std:.0f} times "
+            "noise.fields.std. Mistakes look alike: beam.exact=true tests the usual ones."
+        )
     if setup.scenario.noise.radiometer.form == "exact":
         seen = noise_visibilities(setup, inference.around, radiometer_about(setup))
         if not (known := np.asarray(of_voltages(seen))).all():

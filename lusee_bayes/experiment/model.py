@@ -161,10 +161,7 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
     east = (seen.lon_deg - stated.lon_deg + 180.0) % 360.0 - 180.0
     if max(abs(east), abs(seen.lat_deg - stated.lat_deg)) > SAME_SITE_DEG:
         # luseepy writes a placeholder if no site is configured
-        unsettled = (
-            ", or, if the site in the sessions is a placeholder, --set flight.site=scenario when "
-            "reducing them"
-        )
+        unsettled = ", or reduce with --set flight.site=scenario if their site is a placeholder"
         raise InputError(
             f"the data were taken at longitude {seen.lon_deg:g}, latitude {seen.lat_deg:g} "
             f"degrees, the scenario's site is {stated.lon_deg:g}, {stated.lat_deg:g}; use --set "
@@ -212,8 +209,10 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
     are: gains and sources then belong to the corrected pointing.
     """
     around = around or Around()
+    # far from the mode, what is above lmax is small beside the noise
+    placed = moved(setup, around.values, above=around.tempered == 1.0)
     return [
-        (treatment, cls.build(section, moved(setup, around.values, above=True), around))
+        (treatment, cls.build(section, placed, around))
         for cls, section in present(setup.scenario)
         if (treatment := cls.treatment(setup.scenario)) != "ignored"
     ]
@@ -252,8 +251,7 @@ def in_noise(
     for systematic, before, response in stages:
         later = last if response is None or last is None else last / response
         if isinstance(systematic, ChangedBeams):  # of the antennas as they point
-            turned = before.coupling.of(pointing=model.coupling.pointing)
-            before = replace(before, coupling=turned)
+            before = replace(before, coupling=before.coupling.of(pointing=model.coupling.pointing))
         if systematic.first_order:
             held.append(on_host(Expanded.at(systematic, before, around, later)))
         else:

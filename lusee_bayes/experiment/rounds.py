@@ -53,6 +53,9 @@ FAR_OFF, OTHER_WAYS = 10.0, 10
 CANDIDATES, STALLED = 8, 0.5
 # stop after this number of stalled rounds in a row
 IDLE = 3
+# rounds with larger noise are stuck if it is not halved in PATIENCE rounds; after STUCK such ends,
+# no other starting point is tried
+PATIENCE, STUCK = 6, 3
 # fraction of the current values that these instruments keep, alternating: one half is quickest if
 # most values are right, none if all are wrong
 KEPT = 0.5, 0.0
@@ -210,9 +213,10 @@ def settled(
     the first order in values then has no product with a change of the sky). With many data, this is
     first done with a regular subset of the times. Values move only part of the way if the step is
     long or oscillates. If no sky fits at the end, under any prior, the rounds restart up to ten
-    times (of the subset only: if some data do not fit, neither do all): about half of the values,
-    or all, are drawn again from their prior, and the likeliest of eight such instruments is the
-    start. The result with the largest ln p counts.
+    times, but not after three ends that are stuck far from any fit (of the subset only: if some
+    data do not fit, neither do all): about half of the values, or all, are drawn again from their
+    prior, and the likeliest of eight such instruments is the start. The result with the largest
+    ln p counts.
 
     Parameters
     ----------
@@ -237,7 +241,8 @@ def settled(
     InputError
         If N is not positive definite.
     """
-    report, ways = report or (lambda rounds, remark: None), OTHER_WAYS
+    # a start with a sky is the result of other rounds
+    report, ways = report or (lambda rounds, remark: None), OTHER_WAYS * (start.sky is None)
     if start.sky is None:
         if (few := _fewer(setup, start)) is not None:
             inference, step = _nearby(few[0], _beginning(*few), report, ways)
@@ -298,9 +303,11 @@ def _fewer(setup: Setup, start: Around) -> tuple[Setup, Around] | None:
 def _nearby(setup: Setup, around: Around, report: Report, ways: int) -> tuple[Inference, _Step]:
     """Run rounds until the map has nearly converged; while it does not fit, restart elsewhere."""
     best, step = _approached(setup, around, report)
+    stuck = int(best.around.tempered > 1.0)
     for way in range(ways):
-        if best.moving and not best.fits:
+        if best.moving and not best.fits and stuck < STUCK:
             other = _approached(setup, _elsewhere(setup, best, way), report)
+            stuck += other[0].around.tempered > 1.0
             if other[0].posterior.log_evidence > best.posterior.log_evidence:
                 best, step = other
     return best, step
@@ -308,7 +315,7 @@ def _nearby(setup: Setup, around: Around, report: Report, ways: int) -> tuple[In
 
 def _approached(setup: Setup, around: Around, report: Report) -> tuple[Inference, _Step]:
     """Run rounds until the map has nearly converged; also return the last step."""
-    inference, step = _conditioned(setup, around, 1, None), _Step()
+    inference, step, factors = _conditioned(setup, around, 1, None), _Step(), []
     moves, stalled = np.inf if rebuilds(setup) else 0.0, False
     while moves > NEARLY and not stalled and inference.rounds < MAX_TEMPERED_ROUNDS:
         around, step, exact = _around(setup, inference, step)
@@ -318,6 +325,8 @@ def _approached(setup: Setup, around: Around, report: Report) -> tuple[Inference
         stalled = around.tempered > 1.0 and at_rest and not inference.fits
         del inference  # its N
         if around.tempered > 1.0:
+            factors.append(around.tempered)
+            stalled = stalled or factors[-1] > STALLED * min(factors[:-PATIENCE], default=np.inf)
             exact = _exact(setup, around)
             around = exact.around
             if at_rest:

@@ -122,9 +122,8 @@ def windowed(
     scaled, powers = delta / (largest or 1.0), tilt_powers(order)
     ex, ey = -tilt[:, 0], -tilt[:, 1]
     # the transpose of the exponential has the opposite sign
-    e = np.stack([ex**a * ey**b / factorial(a + b) for a, b in powers], axis=1)
-    weighted = weight[:, None] * e
-    of_power = [weighted * scaled[:, None] ** k for k in range(n_moments)]
+    e = weight[:, None] * np.stack([ex**a * ey**b / factorial(a + b) for a, b in powers], axis=1)
+    of_power = [e * scaled[:, None] ** k for k in range(n_moments)]
     moments = np.stack([np.add.reduceat(x, first, axis=0) for x in of_power], axis=2)
     moments, importance = moments.reshape(len(first), -1), _importance(powers, lmax)
     # small matrices: several threads would wait for one another
@@ -326,8 +325,7 @@ def binned(observation: Observation, keep: TimeFlags, bin_of: Samples, to_s: flo
     # pieces touch up to rounding
     live = np.minimum(np.add.reduceat(windows.live_s, at), end - start)
     begin = np.searchsorted(bin_of_piece, np.arange(len(first)))
-    last = np.append(begin[1:], len(start)) - 1
-    middle = (start[begin] + end[last]) / 2.0
+    middle = (start[begin] + end[np.append(begin[1:], len(start)) - 1]) / 2.0
     times, offset = later(kept.times[first], middle - seconds[first]), middle[bin_of_piece]
     windows = Windows(bin_of_piece, start - offset, end - offset, live)
     return replace(kept, times=times, run=kept.run[first], step_s=to_s, windows=windows)

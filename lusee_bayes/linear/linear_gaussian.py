@@ -475,8 +475,7 @@ class FromInformation(Form):
     def _about(self, data: DataVector, sky: Modes) -> Information:
         """Information of the data, about a reference sky."""
         offset, n = self.model.offset, self.model.n_data
-        centred = data if offset is None else data - offset
-        white = self.factor.whiten(centred - self.coupling @ sky)
+        white = self.factor.whiten(data - (0.0 if offset is None else offset) - self.coupling @ sky)
         vector = self.coupling.transpose_mv(np.asarray(self.factor.whiten_transpose(white)))
         scalars = map(np.asarray, (white @ white, self.factor.log_det(), float(n)))
         return Information(self.matrix, np.asarray(vector), sky, *scalars)

@@ -271,8 +271,7 @@ class Conditioned:
             with stages("usual mistakes"):
                 diagnosis = diagnose(experiment, inference, left)
         if left is not None:
-            truncated = diagnosis is not None and diagnosis.is_truncation
-            judged = self._judged(left, truncated=truncated)
+            judged = self._judged(left, truncated=diagnosis is not None and diagnosis.is_truncation)
         if scenario.noise.pointing is not None or bad:
             with stages("clock and pointing"):
                 pointing = pointing_report(experiment, inference)

@@ -113,8 +113,7 @@ class CorrelatedNormal(Prediction):
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute ln p(d | loc, N) of one data vector, or of every row of an array."""
-        constant = -0.5 * self.factor.log_det() - self.loc.shape[0] * HALF_LOG_2PI
-        return constant - self.misfit(value)
+        return -0.5 * self.factor.log_det() - self.loc.shape[0] * HALF_LOG_2PI - self.misfit(value)
 
     def misfit(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute chi^2 / 2 for every row of an array."""

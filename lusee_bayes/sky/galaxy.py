@@ -665,8 +665,7 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> n
     total = brightness(synchrotron * drawn.emission, depth, frequency_mhz)
     per_measure = absorption_per_emission_measure(frequency_mhz)
     for cloud, covered in zip(drawn.clouds, drawn.covered, strict=True):
-        absorbed = -covered * np.expm1(-per_measure * cloud)
-        total += absorbed * (ELECTRON_TEMPERATURE_K - total)
+        total += -covered * np.expm1(-per_measure * cloud) * (ELECTRON_TEMPERATURE_K - total)
     flux = drawn.flux_jy * (frequency_mhz / FAINT_MHZ) ** FAINT_INDEX
     faint = kelvin_steradian(flux, frequency_mhz) / healpy.nside2pixarea(nside)
     return total + np.exp(-depth) * faint
