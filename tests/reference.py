@@ -18,8 +18,7 @@ SPEED_OF_LIGHT = 299792458.0
 
 def real_harmonics(theta, phi, lmax):
     """Orthonormal real harmonics, (points, modes), from scipy's complex ones."""
-    pairs = [(ell, m) for ell in range(lmax + 1) for m in range(-ell, ell + 1)]
-    ell, m = np.array(pairs).T
+    ell, m = np.array([(ell, m) for ell in range(lmax + 1) for m in range(-ell, ell + 1)]).T
     y = sph_harm_y(ell, np.abs(m), np.asarray(theta)[..., None], np.asarray(phi)[..., None])
     return np.where(m < 0, -y.imag, y.real) * np.where(m == 0, 1.0, np.sqrt(2.0))
 
@@ -90,8 +89,7 @@ def visibilities(response, grid, sky, time, *, lon_deg, lat_deg, turntable_deg=0
     directions of ``grid`` (theta, phi, solid angle); turning the antennas moves those directions.
     """
     theta, phi, solid_angle = grid
-    turned = phi + np.radians(turntable_deg)
-    directions = galactic_directions(theta, turned, time, lon_deg, lat_deg)
+    directions = galactic_directions(theta, phi + np.radians(turntable_deg), time, lon_deg, lat_deg)
     lmax = round(np.sqrt(len(sky))) - 1
     return response @ ((real_harmonics(*directions, lmax) @ sky) * solid_angle)
 

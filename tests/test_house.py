@@ -54,6 +54,11 @@ def test_there_is_one_version():
     assert versions().get("commit") == commit() and "commit" not in versions(with_commit=False)
 
 
+def test_advice_names_no_package_of_an_index():
+    files = [*PACKAGE.rglob("*.py"), *(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
+    assert not [p for p in files if "install 'lusee_bayes[" in p.read_text(encoding="utf-8")]
+
+
 def test_every_text_names_its_encoding():
     """Whatever the locale, files are UTF-8."""
     for path in PACKAGE.rglob("*.py"):

@@ -383,8 +383,7 @@ def test_gaps_are_written(luseepy, tmp_path):
     grid = waterfall.grid[:, keep, :1].copy()
     grid[3, 2] = np.nan
     first = {name: getattr(waterfall, name)[:1] for name in ("frequencies_mhz", "per_kelvin")}
-    observation = waterfall.observation.select(keep)
-    part = replace(waterfall, grid=grid, observation=observation, **first)
+    part = replace(waterfall, grid=grid, observation=waterfall.observation.select(keep), **first)
     path = write_four_port(tmp_path / "w.fits", [part.at(5.0)], [response.circuit(5.0)])
     back = read_waterfall(path)
     np.testing.assert_allclose(back.grid, grid, rtol=3e-16, atol=0)

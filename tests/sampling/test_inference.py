@@ -236,8 +236,7 @@ def test_the_number_of_draws_is_no_part_of_a_runs_identity():
 @pytest.mark.parametrize("site", ["data", "skies"])
 def test_a_site_to_whiten_that_the_program_does_not_sample(gaussian, data, site):
     whitening = lb.Whitening.of(gaussian.condition(data).posterior, site)
-    words = f"no latent site '{site}'; it has sky"
-    refuse(words, sky_chains, gaussian, data, Sampler(), whitening)
+    refuse(f"no latent site '{site}'; it has sky", sky_chains, gaussian, data, Sampler(), whitening)
 
 
 # ---- draws do not depend on how they were kept. A curved little posterior, whose diagonal metric

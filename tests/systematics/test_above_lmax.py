@@ -74,8 +74,9 @@ def test_beams_that_end_before_leave_a_map_and_a_doubt(monkeypatch):
     assert "too much memory" in lb.build(own, data).doubts[0]
 
 
-def test_main_directions_leave_out_as_little_as_singular_vectors():
-    white = np.random.default_rng(1).standard_normal((500, 600)) * np.geomspace(30.0, 1e-4, 600)
+@pytest.mark.parametrize("rows", [500, 700])
+def test_main_directions_leave_out_as_little_as_singular_vectors(rows):
+    white = np.random.default_rng(1).standard_normal((rows, 600)) * np.geomspace(30.0, 1e-4, 600)
     found = main_directions(white.T @ white, 1.0)
     np.testing.assert_allclose(found.T @ found, np.eye(found.shape[1]), atol=1e-9)
     left = np.vdot(white, white) - np.vdot(white @ found, white @ found)
