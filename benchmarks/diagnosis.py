@@ -42,7 +42,7 @@ def main(lmax: int = 47) -> None:
         for run in ("first", "again"):
             before = unit()
             start = time.perf_counter()
-            diagnosis = diagnose(experiment, found, left)
+            diagnosis = diagnose(experiment.setup, found, left)
             seconds = time.perf_counter() - start
             ratio = 2.0 * seconds / (before + unit())
             print(f"{name}, {run}: {diagnosis.n_tried} tried, {seconds:.1f} s, {ratio:.1f} units")

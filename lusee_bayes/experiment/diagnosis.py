@@ -32,9 +32,8 @@ from lusee_bayes.core.arrays import Ells, Grid, Square
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, mode_numbers, n_modes, turn_about_z
 from lusee_bayes.core.linalg import solve_lower
-from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.model import full_model, model_about, moved
+from lusee_bayes.experiment.rounds import Inference, fewer
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
@@ -302,9 +301,7 @@ class MixedProducts:
         n_ports, n = self.judge.setup.beam_source.n_ports, len(self.grid)
         first, second, _ = ports(n_ports)
         autos = first == second
-        mistakes = [DataMistake(*one, weights(mixing)) for *one, mixing in data_mistakes(n_ports)]
-        turned = weights(np.zeros((n, n)), reversed_times=True)
-        mistakes.append(DataMistake("the times are reversed", "sort the data by time", turned))
+        mistakes = self.exchanges()
         names = [f"product {product.label}" for product in all_products(n_ports)]
         some = np.asarray(self.judge.data.layout.present).any(1)
 
@@ -320,6 +317,18 @@ class MixedProducts:
             mistakes.append(self._constant(np.flatnonzero(autos & some)))
         yield from ((self.chi2(mistake.w), mistake) for mistake in mistakes)
         yield from self._times()
+
+    def exchanges(self) -> list[DataMistake]:
+        """Exchanges, signs and reversals: the mistakes without a number to solve for."""
+        n_ports, n = self.judge.setup.beam_source.n_ports, len(self.grid)
+        mistakes = [DataMistake(*one, weights(mixing)) for *one, mixing in data_mistakes(n_ports)]
+        turned = weights(np.zeros((n, n)), reversed_times=True)
+        return [*mistakes, DataMistake("the times are reversed", "sort the data by time", turned)]
+
+    def exchanged(self, base: ChiSquare) -> bool:
+        """Whether one of these explains most of a large misfit, whatever the instrument."""
+        best = min(self.chi2(one.w) for one in self.exchanges())
+        return best < PROMISING * base.chi2 and base.chi2 > LARGE_MISFIT * base.degrees
 
     def chi2(self, w: Columns) -> float:
         """chi^2 of (w, -1)."""
@@ -402,8 +411,11 @@ SCREENED_LMAX = 12
 # number of the best mistakes, in data and in model, to compute at the scenario's lmax; those in the
 # data only if less than this fraction of the excess chi^2 remains
 TRIED, PROMISING = 3, 0.1
-# if nothing makes the data fit, list mistakes that leave less than this fraction of the excess
+# if nothing makes the data fit, list mistakes that leave less than this fraction of the excess, or
+# less than PROMISING if an exchange or sign does: other values of the instrument cannot
 EXPLAINED = 0.03
+# chi^2 per degree of freedom of a large misfit
+LARGE_MISFIT = 10.0
 # a smaller chi^2 per degree of freedom means that without the mistake N would be far too large
 LEAST = 0.5
 # any mistake must reduce the excess by more than this number of standard deviations
@@ -481,21 +493,34 @@ class Diagnosis:
             return [f"As a whole, the data fit without assuming a mistake ({self.chi2.words()})."]
         if not self.proposals:
             return [f"None of the {self.n_tried} usual mistakes explains the misfit."]
-        first = "Did you mean" if self.proposals[0].explains else "Closest, but not enough"
+        first = "Did you mean" if self.proposals[0].explains else "Explains most of the misfit"
         return [f"{first}:"] + [
             f"({number}) {one.words}: {one.remedy} ({one.chi2.words()})."
             for number, one in enumerate(self.proposals, 1)
         ]
 
 
-def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals) -> Diagnosis:
-    """Try the usual mistakes on the data of an experiment.
+def is_mistaken(setup: Setup, start: Around) -> bool:
+    """Whether an exchange, a sign or a reversal in the data explains most of a large misfit.
+
+    Tested with the instrument at the values of ``start``: others could absorb a mistake.
+    """
+    setup, start = fewer(setup, start) or (setup, start)
+    setup = moved(setup, start.values)
+    model, _ = model_about(setup, Around(start.data), moving=False)
+    judge = UnderAnySky.of(setup, start.data, model)
+    base, solution = judge.wide(model.coupling)
+    return MixedProducts.of(judge, solution).exchanged(base)
+
+
+def diagnose(setup: Setup, inference: Inference, residuals: Residuals) -> Diagnosis:
+    """Try the usual mistakes on data.
 
     Parameters
     ----------
-    experiment : Experiment
+    setup : Setup
     inference : Inference
-        Inference from its data alone.
+        Inference from these data alone.
     residuals : Residuals
         Residuals of the map.
 
@@ -503,7 +528,7 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     -------
     Diagnosis
     """
-    setup, data = experiment.setup, experiment.data
+    data = inference.around.data
     judge = UnderAnySky.of(setup, data, inference.model)
     base, solution = judge.wide(judge.model.coupling)
 
@@ -512,7 +537,7 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
         better = sorted((one for one in tried if one[0] < most), key=lambda one: one[0])
         return [one for _, one in better[:TRIED]]
 
-    of_data = list(MixedProducts.of(judge, solution).tried())
+    of_data = list((mixed := MixedProducts.of(judge, solution)).tried())
     promising = base.degrees + PROMISING * abs(base.chi2 - base.degrees)
     proposals = [Proposal(m.words, m.remedy, judge.without(m)) for m in best(of_data, promising)]
     low = Pointing.of(setup.observation, min(SCREENED_LMAX, setup.scenario.lmax))
@@ -525,7 +550,7 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
         Proposal(m.words, m.remedy, judge.under(m.beams, m.observation, setup.pointing))
         for m in best(of_model, whole)
     ]
-    excess = EXPLAINED * abs(base.chi2 - base.degrees)
+    excess = (PROMISING if mixed.exchanged(base) else EXPLAINED) * abs(base.chi2 - base.degrees)
     nearly = [one for one in proposals if one.excess < excess and not one.chi2.too_small]
     others = list(_noise_of(judge, "exact"))
     suffice = [one for one in (*proposals, *others) if one.suffices(base)]

@@ -23,9 +23,10 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment import rounds
+from lusee_bayes.experiment.diagnosis import is_mistaken
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
@@ -115,7 +116,8 @@ def build(
     """
     stages = stages or Stages()
     experiment = _fitting(observed(scenario, data, stages), stages)
-    return _learned(experiment, Around(experiment.data, values=values), stages, earlier)
+    start = Around(experiment.data, values=values)
+    return _learned(_searchable(experiment, start, stages), start, stages, earlier)
 
 
 def observed(
@@ -167,6 +169,23 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
         stages.say(f"  {fit.remark}")
         doubts = (*doubts, fit.remark)
     return replace(experiment, setup=setup, data=kept, doubts=doubts, fitting=fit)
+
+
+def _searchable(experiment: Experiment, start: Around, stages: Stages) -> Experiment:
+    """Keep the instrument as expected if the data contain a mistake that it could absorb."""
+    setup, unknown = experiment.setup, rounds.first_order(experiment.scenario)
+    if not (setup.measured and unknown) or setup.scenario.samples:
+        return experiment
+    with stages("usual mistakes"):
+        if not is_mistaken(setup, start):
+            return experiment
+    ignored = [f"{cls.key}.treatment=ignored" for cls in unknown]
+    setup = replace(setup, scenario=load_scenario(setup.scenario, ignored))
+    words = (
+        "An exchange or sign in the data explains most of the misfit. The instrument is kept as "
+        "expected: with this mistake, its unknowns cannot be found."
+    )
+    return replace(experiment, setup=setup, doubts=(*experiment.doubts, words))
 
 
 def _learned(

@@ -244,7 +244,7 @@ def settled(
     # a start with a sky is the result of other rounds
     report, ways = report or (lambda rounds, remark: None), OTHER_WAYS * (start.sky is None)
     if start.sky is None:
-        if (few := _fewer(setup, start)) is not None:
+        if (few := fewer(setup, start)) is not None:
             inference, step = _nearby(few[0], _beginning(*few), report, ways)
             # if some of the data do not fit, neither do all
             ways = OTHER_WAYS if inference.fits else 0
@@ -290,7 +290,7 @@ def settled(
     )
 
 
-def _fewer(setup: Setup, start: Around) -> tuple[Setup, Around] | None:
+def fewer(setup: Setup, start: Around) -> tuple[Setup, Around] | None:
     """The same at a regular subset of times that suffices to find the instrument, or None."""
     run, data = setup.observation.run, start.data
     stride = len(data.data) // (ENOUGH * setup.prior.size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,12 +66,14 @@ class Split:
         """
         n_known = n_data - (expected_chi2(posterior, n_data) if expected is None else expected)
         size = max(1.0, np.sqrt(float(posterior.prior_chi2()) / n_known)) if n_known > 0 else 1.0
-        try:
-            wide, less = widened(posterior, WIDER * size, matrix)
-        except InputError:
-            # data that do not fit require a sky that is brighter by orders of magnitude, under
-            # which float64 cannot separate noise from sky; they stand out under this one, too
-            wide, less = widened(posterior, WIDER, matrix)
+        # data that do not fit require a sky that is brighter by orders of magnitude, under which
+        # float64 cannot separate noise from sky; they stand out under narrower ones, too
+        for factor in (WIDER * size, WIDER, WIDER**0.5):
+            with suppress(InputError):
+                wide, less = widened(posterior, factor, matrix)
+                break
+        else:
+            wide, less = widened(posterior, 1.0, matrix)
         instrument = beside_any_sky(chi2 - less, wide, n_data)
         return cls(instrument, ChiSquare(less, n_data - instrument.degrees), wide)
 

@@ -269,7 +269,7 @@ class Conditioned:
         bad = left is not None and left.level() == "does not fit"
         if bad or thorough:
             with stages("usual mistakes"):
-                diagnosis = diagnose(experiment, inference, left)
+                diagnosis = diagnose(experiment.setup, inference, left)
         if left is not None:
             judged = self._judged(left, truncated=diagnosis is not None and diagnosis.is_truncation)
         if scenario.noise.pointing is not None or bad:

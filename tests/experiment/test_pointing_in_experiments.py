@@ -72,7 +72,7 @@ def test_a_clock_and_a_turntable_that_are_off_are_found(known_sky):
 
 
 def diagnosis(experiment, found):
-    return diagnose(experiment, found, residuals(found.solution, experiment.data))
+    return diagnose(experiment.setup, found, residuals(found.solution, experiment.data))
 
 
 def test_ignored_the_report_points_at_it(known_sky):
