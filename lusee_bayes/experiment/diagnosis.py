@@ -32,8 +32,8 @@ from lusee_bayes.core.arrays import Ells, Grid, Square
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, mode_numbers, n_modes, turn_about_z
 from lusee_bayes.core.linalg import solve_lower
-from lusee_bayes.experiment.model import full_model, model_about, moved
-from lusee_bayes.experiment.rounds import Inference, fewer
+from lusee_bayes.experiment.model import full_model, moved
+from lusee_bayes.experiment.rounds import Inference, as_expected
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
@@ -152,6 +152,9 @@ def data_mistakes(n_ports: int) -> Iterator[tuple[str, str, Mixing]]:
         wrong = f"the ports are rotated by {turn}: the model's port 0 is the data's port {turn}"
         turned = port_mixing([(port + turn) % n_ports for port in numbers])
         yield wrong, "number the ports of the data like those of the beams", turned
+    for k in np.flatnonzero(first != second):
+        signs = 1.0 - 2.0 * (np.arange(len(products)) == k)
+        yield f"product {products[k].label} has the wrong sign", "change its sign", np.diag(signs)
     for i, j in combinations(range(len(products)), 2):
         order = np.arange(len(products))
         order[[i, j]] = j, i
@@ -207,7 +210,8 @@ class UnderAnySky:
     Attributes
     ----------
     setup : Setup
-    data : Visibilities
+    around : Around
+        The data, and the expansion point of the model.
     model : LinearGaussian
         Model of these data.
     spectrum : (ells,) array
@@ -215,19 +219,27 @@ class UnderAnySky:
     """
 
     setup: Setup
-    data: Visibilities
+    around: Around
     model: LinearGaussian
     spectrum: Ells
 
+    @property
+    def data(self) -> Visibilities:
+        """The data."""
+        return self.around.data
+
     @classmethod
-    def of(cls, setup: Setup, data: Visibilities, model: LinearGaussian) -> UnderAnySky:
+    def of(cls, setup: Setup, around: Around, model: LinearGaussian | None = None) -> UnderAnySky:
         """Choose a prior that allows any sky as bright as the data suggest."""
+        model = model or full_model(setup, around)
         prior = setup.prior if setup.family is None else setup.family.expected()
         power = np.asarray(prior.variance() + prior.colour(prior.white_mean) ** 2)
         autos = auto_indices(setup.beam_source.n_ports)
         modelled = float(np.median(np.asarray(setup.signal)[autos]))
-        brighter = np.nanmedian(np.append(np.asarray(data.grid())[autos], modelled)) / modelled
-        return cls(setup, data, model, mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2)
+        brighter = (
+            np.nanmedian(np.append(np.asarray(around.data.grid())[autos], modelled)) / modelled
+        )
+        return cls(setup, around, model, mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2)
 
     def wide(self, coupling: Coupling) -> tuple[ChiSquare, Solution]:
         """Residual chi^2, and the solution under the wide prior."""
@@ -255,10 +267,11 @@ class UnderAnySky:
         layout = self.data.layout
         data = replace(self.data, data=np.asarray(layout.gather(mistake.undone(filled(self.data)))))
         try:
-            model = full_model(self.setup, Around(data))
+            around = replace(self.around, data=data, visibilities=None, gains=None)
+            model = full_model(self.setup, around)
         except InputError:  # undoing it makes some auto negative or zero
             return ChiSquare(np.inf, float(layout.size))
-        return replace(self, data=data, model=model).wide(model.coupling)[0]
+        return replace(self, around=around, model=model).wide(model.coupling)[0]
 
 
 def filled(data: Visibilities) -> Grid:
@@ -301,7 +314,6 @@ class MixedProducts:
         n_ports, n = self.judge.setup.beam_source.n_ports, len(self.grid)
         first, second, _ = ports(n_ports)
         autos = first == second
-        mistakes = self.exchanges()
         names = [f"product {product.label}" for product in all_products(n_ports)]
         some = np.asarray(self.judge.data.layout.present).any(1)
 
@@ -310,25 +322,26 @@ class MixedProducts:
             return bool(0 < np.count_nonzero(which[some]) < some.sum())
 
         factors = [*zip(names, np.eye(n), strict=True), ("every auto", autos * 1.0)]
-        mistakes += [self._factor(*one) for one in factors if apart(one[1])]
+        mistakes = [self._factor(*one) for one in factors if apart(one[1])]
         gains = [(k, 1.0 * (first == k) + (second == k)) for k in range(n_ports)]
         mistakes += [self._gain(*one) for one in gains if apart(one[1])]
         if (autos & some).any():
             mistakes.append(self._constant(np.flatnonzero(autos & some)))
         yield from ((self.chi2(mistake.w), mistake) for mistake in mistakes)
-        yield from self._times()
+        yield from self.plain()
 
-    def exchanges(self) -> list[DataMistake]:
-        """Exchanges, signs and reversals: the mistakes without a number to solve for."""
+    def plain(self) -> Iterator[tuple[float, DataMistake]]:
+        """Exchanges, signs, reversals and wrong times: mistakes unlike any instrument."""
         n_ports, n = self.judge.setup.beam_source.n_ports, len(self.grid)
         mistakes = [DataMistake(*one, weights(mixing)) for *one, mixing in data_mistakes(n_ports)]
         turned = weights(np.zeros((n, n)), reversed_times=True)
-        return [*mistakes, DataMistake("the times are reversed", "sort the data by time", turned)]
+        mistakes.append(DataMistake("the times are reversed", "sort the data by time", turned))
+        yield from ((self.chi2(mistake.w), mistake) for mistake in mistakes)
+        yield from self._times()
 
-    def exchanged(self, base: ChiSquare) -> bool:
-        """Whether one of these explains most of a large misfit, whatever the instrument."""
-        best = min(self.chi2(one.w) for one in self.exchanges())
-        return best < PROMISING * base.chi2 and base.chi2 > LARGE_MISFIT * base.degrees
+    def explains(self, base: ChiSquare) -> bool:
+        """Whether one of these explains most of a large misfit."""
+        return min(chi2 for chi2, _ in self.plain()) < PROMISING * base.chi2
 
     def chi2(self, w: Columns) -> float:
         """chi^2 of (w, -1)."""
@@ -370,9 +383,9 @@ class MixedProducts:
         """A factor of all products at one time, for each of the worst times."""
         data, layout, values = self.judge.data, self.judge.data.layout, self.solution.data
         left = self.solution.weighted_residual()  # K^-1 (d - b)
-        solved = np.asarray(self.solution.factor.solve(values))
+        variance = np.asarray(self.solution.model.noise.diagonal())
         pull = np.bincount(layout.time, values * left, layout.n_times)
-        most = np.bincount(layout.time, values * solved, layout.n_times)
+        most = np.bincount(layout.time, values**2 / variance, layout.n_times)
         worst = np.argsort(-(pull**2) / np.where(most > 0.0, most, np.inf))[:TIMES]
         worst = worst[most[worst] > 0.0]
         columns = np.where(layout.time[:, None] == worst, values[:, None], 0.0)
@@ -412,10 +425,8 @@ SCREENED_LMAX = 12
 # data only if less than this fraction of the excess chi^2 remains
 TRIED, PROMISING = 3, 0.1
 # if nothing makes the data fit, list mistakes that leave less than this fraction of the excess, or
-# less than PROMISING if an exchange or sign does: other values of the instrument cannot
+# less than PROMISING if a plain mistake does
 EXPLAINED = 0.03
-# chi^2 per degree of freedom of a large misfit
-LARGE_MISFIT = 10.0
 # a smaller chi^2 per degree of freedom means that without the mistake N would be far too large
 LEAST = 0.5
 # any mistake must reduce the excess by more than this number of standard deviations
@@ -501,16 +512,14 @@ class Diagnosis:
 
 
 def is_mistaken(setup: Setup, start: Around) -> bool:
-    """Whether an exchange, a sign or a reversal in the data explains most of a large misfit.
+    """Whether a plain mistake in the data explains most of a large misfit.
 
     Tested with the instrument at the values of ``start``: others could absorb a mistake.
     """
-    setup, start = fewer(setup, start) or (setup, start)
-    setup = moved(setup, start.values)
-    model, _ = model_about(setup, Around(start.data), moving=False)
-    judge = UnderAnySky.of(setup, start.data, model)
-    base, solution = judge.wide(model.coupling)
-    return MixedProducts.of(judge, solution).exchanged(base)
+    judge = UnderAnySky.of(as_expected(moved(setup, start.values)), Around(start.data))
+    base, solution = judge.wide(judge.model.coupling)
+    large = PROMISING * base.chi2 > base.degrees
+    return large and MixedProducts.of(judge, solution).explains(base)
 
 
 def diagnose(setup: Setup, inference: Inference, residuals: Residuals) -> Diagnosis:
@@ -527,9 +536,18 @@ def diagnose(setup: Setup, inference: Inference, residuals: Residuals) -> Diagno
     Returns
     -------
     Diagnosis
+        With the instrument as expected if this explains a misfit: unknowns absorb part of it.
     """
-    data = inference.around.data
-    judge = UnderAnySky.of(setup, data, inference.model)
+    if inference.moving and residuals.level() == "does not fit":
+        judge = UnderAnySky.of(as_expected(setup), Around(inference.around.data))
+        if (found := _tried(judge, residuals)).proposals:
+            return found
+    return _tried(UnderAnySky.of(setup, inference.around, inference.model), residuals)
+
+
+def _tried(judge: UnderAnySky, residuals: Residuals) -> Diagnosis:
+    """Try the usual mistakes on data under a model."""
+    setup, data = judge.setup, judge.data
     base, solution = judge.wide(judge.model.coupling)
 
     def best(tried: Sequence[tuple[float, object]], most: float) -> list:
@@ -550,7 +568,7 @@ def diagnose(setup: Setup, inference: Inference, residuals: Residuals) -> Diagno
         Proposal(m.words, m.remedy, judge.under(m.beams, m.observation, setup.pointing))
         for m in best(of_model, whole)
     ]
-    excess = (PROMISING if mixed.exchanged(base) else EXPLAINED) * abs(base.chi2 - base.degrees)
+    excess = (PROMISING if mixed.explains(base) else EXPLAINED) * abs(base.chi2 - base.degrees)
     nearly = [one for one in proposals if one.excess < excess and not one.chi2.too_small]
     others = list(_noise_of(judge, "exact"))
     suffice = [one for one in (*proposals, *others) if one.suffices(base)]
@@ -569,7 +587,7 @@ def _noise_of(judge: UnderAnySky, form: str) -> Iterator[Proposal]:
     scenario = judge.setup.scenario
     if scenario.noise.radiometer.form != form:
         scenario = load_scenario(scenario, [f"noise.radiometer.form={form}"])
-        model = full_model(replace(judge.setup, scenario=scenario), Around(judge.data))
+        model = full_model(replace(judge.setup, scenario=scenario), judge.around)
         chi2 = replace(judge, model=model).wide(model.coupling)[0]
         how = {"exact": "correlated", "paper": "independent, as in some simulations"}[form]
         words = f"the noise of the products is {how}"

@@ -26,7 +26,7 @@ from lusee_bayes.experiment import rounds
 from lusee_bayes.experiment.diagnosis import is_mistaken
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
-from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
@@ -173,19 +173,17 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
 
 def _searchable(experiment: Experiment, start: Around, stages: Stages) -> Experiment:
     """Keep the instrument as expected if the data contain a mistake that it could absorb."""
-    setup, unknown = experiment.setup, rounds.first_order(experiment.scenario)
-    if not (setup.measured and unknown) or setup.scenario.samples:
+    setup, sampled = experiment.setup, experiment.scenario.samples
+    if sampled or not (setup.measured and rounds.first_order(setup.scenario)):
         return experiment
     with stages("usual mistakes"):
         if not is_mistaken(setup, start):
             return experiment
-    ignored = [f"{cls.key}.treatment=ignored" for cls in unknown]
-    setup = replace(setup, scenario=load_scenario(setup.scenario, ignored))
     words = (
-        "An exchange or sign in the data explains most of the misfit. The instrument is kept as "
-        "expected: with this mistake, its unknowns cannot be found."
+        "A mistake in the data explains most of the misfit. The instrument is kept as expected: "
+        "its unknowns would absorb part of this mistake."
     )
-    return replace(experiment, setup=setup, doubts=(*experiment.doubts, words))
+    return replace(experiment, setup=rounds.as_expected(setup), doubts=(*experiment.doubts, words))
 
 
 def _learned(

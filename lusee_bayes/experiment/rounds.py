@@ -18,7 +18,7 @@ from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
 from lusee_bayes.experiment.model import model_about, moved, with_sky_above
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes, variance_factor
 from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
@@ -244,7 +244,7 @@ def settled(
     # a start with a sky is the result of other rounds
     report, ways = report or (lambda rounds, remark: None), OTHER_WAYS * (start.sky is None)
     if start.sky is None:
-        if (few := fewer(setup, start)) is not None:
+        if (few := _fewer(setup, start)) is not None:
             inference, step = _nearby(few[0], _beginning(*few), report, ways)
             # if some of the data do not fit, neither do all
             ways = OTHER_WAYS if inference.fits else 0
@@ -290,7 +290,7 @@ def settled(
     )
 
 
-def fewer(setup: Setup, start: Around) -> tuple[Setup, Around] | None:
+def _fewer(setup: Setup, start: Around) -> tuple[Setup, Around] | None:
     """The same at a regular subset of times that suffices to find the instrument, or None."""
     run, data = setup.observation.run, start.data
     stride = len(data.data) // (ENOUGH * setup.prior.size)
@@ -495,6 +495,12 @@ def first_order(scenario: Scenario) -> tuple[type[Systematic], ...]:
     )
 
 
+def as_expected(setup: Setup) -> Setup:
+    """The same with these systematics ignored: the instrument keeps its expected values."""
+    ignored = [f"{cls.key}.treatment=ignored" for cls in first_order(setup.scenario)]
+    return replace(setup, scenario=load_scenario(setup.scenario, ignored))
+
+
 def rebuilds_visibilities(setup: Setup) -> bool:
     """Whether gains or radiometer noise are built around the posterior's prediction."""
     gains = is_modelled(setup.scenario.noise.gain) and gains_about(setup) == "posterior"
@@ -524,6 +530,8 @@ def prediction(setup: Setup, inference: Inference, solved: DataVector) -> Grid:
     return setup.under(mean).signal + setup.layout.scatter(besides)
 
 
+# largest factor of N under which the sky above lmax is learned
+MOST_RAISED = 10.0
 # a larger problem first learns its parameters up to this ell, in a tenth of the time
 COARSE_LMAX = 24
 
@@ -567,7 +575,8 @@ def with_learned_prior(
         plain = _with_surveys(setup, ()) if surveys else setup
         coarse, learned = first_learned(plain, whole(result.solution.information))
         start = result.around
-        if learned.settled:
+        # data that do not fit say nothing about the sky above lmax
+        if learned.settled and learned.noise_factor < MOST_RAISED:
             family = setup.above.family
             if surveys:
                 top = setup.scenario.noise.above_lmax.top(setup.scenario.lmax)

@@ -297,7 +297,7 @@ def learn_whatever_fits(
         with suppress(InputError):
             learned = learn(family, information.raised(factor), start, seed)
             if factor > 1.0:  # check that there is a posterior under N itself
-                information.posterior(learned.prior)
+                information.posterior(learned.prior).std()
             return replace(learned, noise_factor=float(factor))
     return _fixed(family, information, float(demanded * HIGHER[-1]))
 

@@ -218,7 +218,9 @@ def diagnosed(wrong, scenario=None):
     data = replace(wrong.make(scenario, sky(scenario.lmax), 1), truth=None)
     experiment = lb.build(scenario, data)
     found = lb.infer(experiment)
-    return (left := residuals(found.solution, data)), diagnosis.diagnose(experiment.setup, found, left)
+    return (left := residuals(found.solution, data)), diagnosis.diagnose(
+        experiment.setup, found, left
+    )
 
 
 def is_named(wrong, found):
@@ -251,7 +253,9 @@ def test_the_form_of_the_noise_is_named(right, wrong):
     data = wrong_data.measured(right, sky(6), 1)
     experiment = lb.build(wrong, data)
     found = lb.infer(experiment)
-    (first,) = diagnosis.diagnose(experiment.setup, found, residuals(found.solution, data)).proposals
+    (first,) = diagnosis.diagnose(
+        experiment.setup, found, residuals(found.solution, data)
+    ).proposals
     assert right.noise.radiometer.form in first.remedy and first.chi2.fits
 
 
