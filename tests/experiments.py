@@ -87,8 +87,7 @@ def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
 
 def correlated(prior: Prior) -> DensePrior:
     """A prior with a mean and about this one's widths, whose modes are correlated."""
-    width = np.sqrt(np.asarray(prior.variance()))
-    rng = np.random.default_rng(6)
+    width, rng = np.sqrt(np.asarray(prior.variance())), np.random.default_rng(6)
     covariance = random_covariance(rng, len(width)) * width * width[:, None]
     mean = 0.3 * width * rng.normal(size=len(width))
     return DensePrior(jnp.linalg.cholesky(covariance), mean=jnp.asarray(mean))

@@ -62,8 +62,7 @@ def white_posterior(a, prior_std, noise_std, d) -> Answer:
     rows = np.concatenate([a * prior_std / noise_std[:, None], np.eye(len(prior_std))])
     white = np.concatenate([d / noise_std, np.zeros(len(prior_std))])
     q, r = np.linalg.qr(rows)
-    half = np.linalg.inv(r)
-    chi2 = ((white - q @ (q.T @ white)) ** 2).sum()
+    half, chi2 = np.linalg.inv(r), ((white - q @ (q.T @ white)) ** 2).sum()
     log_det = np.log(np.abs(np.diag(r))).sum() + np.log(noise_std).sum()
     log_prob = -0.5 * chi2 - log_det - 0.5 * len(d) * np.log(2 * np.pi)
     covariance = prior_std[:, None] * (half @ half.T) * prior_std
@@ -93,10 +92,8 @@ def exact_posterior(a, prior_variance, n, d, digits: int = 60) -> Answer:
     with localcontext(prec=digits):
         a, s, n, d = (exact(np.asarray(x)) for x in (a, prior_variance, n, d))
         a_s = a * s[None]
-        k = a_s @ a.T + n
-        solved, log_det = solve_exactly(k, np.concatenate([a_s, d[:, None]], axis=1))
-        mean = a_s.T @ solved[:, -1]
-        covariance = -(a_s.T @ solved[:, :-1])
+        solved, log_det = solve_exactly(a_s @ a.T + n, np.concatenate([a_s, d[:, None]], axis=1))
+        mean, covariance = a_s.T @ solved[:, -1], -(a_s.T @ solved[:, :-1])
         covariance[np.diag_indices(len(s))] += s
         two_pi = Decimal("6.28318530717958647692528676655900576839433879875021")
         log_prob = -(d @ solved[:, -1] + log_det + len(d) * two_pi.ln()) / 2

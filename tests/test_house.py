@@ -19,8 +19,7 @@ ROOT = PACKAGE.parent
 
 def test_exports_are_static_and_are_what_they_say():
     """Every public name stands in __init__.pyi, as a type checker reads it, and is there."""
-    stub = ast.parse((PACKAGE / "__init__.pyi").read_text())
-    exported = {}
+    stub, exported = ast.parse((PACKAGE / "__init__.pyi").read_text()), {}
     for statement in stub.body:
         assert isinstance(statement, ast.ImportFrom)
         assert statement.level == 1

@@ -73,10 +73,7 @@ def require_float64(name: str, array: Any) -> None:
     dtype = getattr(array, "dtype", None)
     if dtype != np.float64:
         got = f"an array of {dtype}" if dtype is not None else f"a {type(array).__name__}"
-        raise InputError(
-            f"{name} must be a float64 array, got {got}; convert it with "
-            "numpy.asarray(x, dtype=numpy.float64)"
-        )
+        raise InputError(f"{name} must be a float64 array, got {got}; use x.astype(numpy.float64)")
 
 
 def require_shape(name: str, array: Any, shape: tuple[int | None, ...]) -> None:

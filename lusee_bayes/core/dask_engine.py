@@ -227,8 +227,7 @@ def own_workers(n: int, demand: engine.Demand) -> Iterator[distributed.LocalClus
     needed = n * demand.process_bytes(side_by_side)
     if needed > memory_limit():
         raise InputError(
-            f"{n} workers need about {gigabytes(needed)} of memory; this machine has "
-            f"{gigabytes(memory_limit())}: use fewer"
+            f"{n} workers need {gigabytes(needed)} of {gigabytes(memory_limit())}: use fewer"
         )
     settings = {
         # Dask makes glibc return memory early (MALLOC_TRIM_THRESHOLD_). This also fixes at 128 kB

@@ -414,8 +414,7 @@ def _horizontal_generators(lmax: int) -> tuple[np.ndarray, np.ndarray]:
 def apply_generator(modes: Fields, axis: int) -> Fields:
     """Return K_x (axis 0) or K_y (axis 1) times packed modes, in time linear in their number."""
     columns, weights = _horizontal_generators(round(np.sqrt(modes.shape[-1])) - 1)
-    shape = (1,) * (modes.ndim - 1) + (-1,)
-    first, second = (weights[axis, :, i].reshape(shape) for i in (0, 1))
+    first, second = (weights[axis, :, i].reshape((1,) * (modes.ndim - 1) + (-1,)) for i in (0, 1))
     return first * modes[..., columns[axis, :, 0]] + second * modes[..., columns[axis, :, 1]]
 
 

@@ -221,8 +221,7 @@ class Layout:
         n_bytes = sum(8 * int(np.prod(arrays[n].shape, dtype=object)) for n in present)
         if n_bytes > memory_limit():
             raise InputError(
-                f"{path} declares {gigabytes(n_bytes)} of numbers; this machine has "
-                f"{gigabytes(memory_limit())} of memory"
+                f"{path} declares {gigabytes(n_bytes)}; the memory is {gigabytes(memory_limit())}"
             )
         read = {}
         for name, declared in present.items():

@@ -102,8 +102,7 @@ def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
         raise
     except Exception as error:
         raise InputError(
-            f"{path} cannot be read as {what}: {_reason(error)}; it is truncated, damaged, or of "
-            "another kind"
+            f"{path} cannot be read as {what}: {_reason(error)}; it is damaged or of another kind"
         ) from error
 
 

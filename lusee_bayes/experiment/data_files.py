@@ -31,8 +31,7 @@ from lusee_bayes.instrument.visibilities import HINT, Visibilities, read_visibil
 from lusee_bayes.instrument.waterfalls import INTERPOLATIONS, Waterfall, read_waterfall
 
 ACCEPTED = (
-    "visibilities (lusee-bayes simulate), a waterfall of luseepy, sessions of its lusee.ingest, or "
-    "spectra of lusee-bayes reduce"
+    "visibilities (lusee-bayes simulate), a waterfall of luseepy, sessions or reduced spectra"
 )
 # images that only luseepy's waterfalls have among FITS files
 WATERFALL_IMAGES = {"combinations", "products"}
@@ -345,8 +344,7 @@ def recipe_of(scenario: Scenario) -> Recipe:
     if section.bin_origin is None:
         raise InputError(
             "the scenario must specify whether k times 25 kHz is the centre or the lower edge of "
-            "channel k, which differ by 12.5 kHz; use --set flight.bin_origin=centre (luseepy's "
-            "labels) or edge"
+            "channel k; use --set flight.bin_origin=centre (luseepy's labels) or edge"
         )
     if (timestamp := scenario.observation.timestamp) is None:
         raise InputError(

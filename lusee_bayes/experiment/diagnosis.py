@@ -396,10 +396,8 @@ class MixedProducts:
                 continue
             factor = 1.0 - pull[time] / bend
             when = data.observation.times[time].isot[:19]
-            wrong = (
-                f"all products at {when} are {_number(1.0 / factor, bend**-0.5)} times the "
-                "prediction from other times"
-            )
+            times = _number(1.0 / factor, bend**-0.5)
+            wrong = f"all products at {when} are {times} times the prediction from other times"
             right = weights(factor * np.eye(len(self.grid)))
             mistake = DataMistake(wrong, "flag this time", right, time)
             yield self.chi2(whole) - pull[time] ** 2 / bend, mistake
@@ -518,8 +516,7 @@ def is_mistaken(setup: Setup, start: Around) -> bool:
     """
     judge = UnderAnySky.of(as_expected(moved(setup, start.values)), Around(start.data))
     base, solution = judge.wide(judge.model.coupling)
-    large = PROMISING * base.chi2 > base.degrees
-    return large and MixedProducts.of(judge, solution).explains(base)
+    return PROMISING * base.chi2 > base.degrees and MixedProducts.of(judge, solution).explains(base)
 
 
 def diagnose(setup: Setup, inference: Inference, residuals: Residuals) -> Diagnosis:
@@ -573,8 +570,7 @@ def _tried(judge: UnderAnySky, residuals: Residuals) -> Diagnosis:
     others = list(_noise_of(judge, "exact"))
     suffice = [one for one in (*proposals, *others) if one.suffices(base)]
     # these always absorb part of any misfit, and count only if they absorb all of it
-    absorbing_ways = _finer(judge), _noise_level(residuals, data), _noise_of(judge, "paper")
-    for absorbing in absorbing_ways:
+    for absorbing in _finer(judge), _noise_level(residuals, data), _noise_of(judge, "paper"):
         if not suffice:
             others += (last := list(absorbing))
             suffice = [one for one in last if one.suffices(base)]

@@ -403,8 +403,7 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
             )
     if learned is not None and learned.still_moves > 0.0:
         notes.append(
-            "Learning the prior did not converge: the map still changes by "
-            f"{learned.still_moves:.2g} standard deviations per round."
+            f"The prior did not converge: maps still move by {learned.still_moves:.2g} of their errors."
         )
     if inference.unsettled:
         notes.append(inference.unsettled)

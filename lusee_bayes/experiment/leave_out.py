@@ -243,8 +243,7 @@ def fitting(
         flagged, blamed = more
         gone, groups = gone | flagged, (*groups, *blamed)
         stages.say(
-            f"  times compared at lmax={setup.scenario.lmax}, round {rounds}: "
-            f"{rules.count(gone)} of {n} values flagged"
+            f"  lmax={setup.scenario.lmax}, round {rounds}: {rules.count(gone)} of {n} flagged"
         )
         if not flagged.any():
             share = rules.count(gone) / n
@@ -289,8 +288,7 @@ class _Rules:
         first, second, _ = ports(n_ports)
         used, left = self.present.any(axis=1), (self.present & ~gone).any(axis=1)
         for port, auto in enumerate(auto_indices(n_ports)):
-            crosses = (first == port) | (second == port)
-            if used[auto] and not left[auto] and left[crosses].any():
+            if used[auto] and not left[auto] and left[(first == port) | (second == port)].any():
                 return port
         return None
 

@@ -236,14 +236,12 @@ class Scenario(Section):
             )
         if error is not None and error.parameters and not self.beam.has_parameters:
             raise ValueError(
-                "noise.beam.parameters describe the embedded antennas, which beam.file "
-                "replaces; use noise.beam.shift_mhz or noise.beam.file, or files over a grid of "
-                "parameters (beam.model=grid)"
+                "noise.beam.parameters describe the embedded antennas, which beam.file replaces; "
+                "use noise.beam.shift_mhz or noise.beam.file, or a grid of files (beam.model=grid)"
             )
         if (self.beam.is_file or (error is not None and error.file is not None)) and own_sources:
             raise ValueError(
-                "sources.list needs the exact beams of the embedded antennas; remove beam.file "
-                "and noise.beam.file, or the sources"
+                "sources.list needs exact embedded beams; remove beam.file and noise.beam.file"
             )
         if self.joint and (prior.has_files or prior.surveys or getattr(prior, "scale", 1.0) != 1.0):
             raise ValueError(
@@ -251,8 +249,7 @@ class Scenario(Section):
             )
         if many and prior.has_files and prior.file_frequency_mhz is None:
             raise ValueError(
-                "the files of the prior are for one frequency; with frequencies_mhz, give it as "
-                "prior.file_frequency_mhz"
+                "files of the prior are for one frequency; give it as prior.file_frequency_mhz"
             )
         return self
 

@@ -58,8 +58,7 @@ def said_in(file: Mapping[str, Any]) -> dict[str, Any]:
 def no_spectra(path: Path, lacking: str, names: Iterable[str]) -> InputError:
     """Return the error for a file without spectra, with a list of its contents."""
     return InputError(
-        f"{path} has no {lacking}: the session contains no spectra (it has "
-        f"{', '.join(names) or 'nothing'})"
+        f"{path} has no {lacking}: it contains no spectra, but {', '.join(names) or 'nothing'}"
     )
 
 

@@ -94,8 +94,7 @@ def require_ephemeris(jd: Times) -> None:
         with unannounced_leap_seconds():
             date = Time(at, format="jd").isot[:19]
     raise InputError(
-        f"sample times lie outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
-        f"{date}; choose a start within it"
+        f"{date} is outside the ephemeris, {EPHEMERIS_YEARS[0]} to {EPHEMERIS_YEARS[1]}"
     )
 
 

@@ -60,8 +60,7 @@ def require_plausible(data: Visibilities, signal: Grid, std: DataVector) -> tupl
     _refuse(
         data,
         np.isin(np.arange(len(values)), autos)[:, None] & (values < -SIGNIFICANT * sigma),
-        "an auto-correlation that is significantly negative; check signs and order of the "
-        "products, or flag the sample (NaN)",
+        "a clearly negative auto-correlation; check signs and order of products, or flag it (NaN)",
     )
     return (*_about_range(values[autos], modelled[autos]), *_about_crosses(data, values, sigma))
 

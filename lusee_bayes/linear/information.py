@@ -75,8 +75,7 @@ class Information(Described, eqx.Module):
 
     def description(self) -> tuple[str, ...]:
         return (
-            f"ln p(d | m) of {number(self.n_data, '.0f')} data, for {self.n_modes} modes of the "
-            "sky, in K",
+            f"ln p(d | m) of {number(self.n_data, '.0f')} data, for {self.n_modes} sky modes, in K",
         )
 
     @property

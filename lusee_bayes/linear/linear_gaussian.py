@@ -91,8 +91,7 @@ class LinearGaussian(Described, eqx.Module):
             )
         if self.prior.size != n_unknowns:
             raise InputError(
-                f"the coupling matrix has {n_unknowns} columns, the prior {self.prior.size} "
-                "unknowns; give both the same lmax"
+                f"A has {n_unknowns} columns, the prior {self.prior.size} unknowns; use one lmax"
             )
         if self.offset is not None:
             require_array("the offset", self.offset, (n_data,))
@@ -504,8 +503,7 @@ class Whitened(Form):
         if not is_traced(solver.lower) and not np.isfinite(np.diagonal(solver.lower)).all():
             model.noise.factor()  # outside jit: raises and names the term that is not positive
             raise InputError(
-                "Lambda = 1 + W^T W could not be factorised: the data are too precise for the "
-                "normal equations; use form=InData"
+                "Lambda has no Cholesky factor: the data are too precise; use form=InData"
             )
         return solver
 

@@ -102,22 +102,6 @@ class Posterior(Described, eqx.Module):
         """
         return _checked(*_std(self))
 
-    def std_of(self, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
-        """Compute the standard deviation of linear combinations of the unknowns.
-
-        Parameters
-        ----------
-        directions : (n, unknowns) array
-            One combination per row, such as rows of ``harmonics.pixel_matrix`` for pixels.
-
-        Returns
-        -------
-        (n,) array
-            In K, if the directions have no unit.
-        """
-        xp = namespace(self)
-        return xp.sqrt(((xp.asarray(directions) @ self.root()) ** 2).sum(1))
-
     def covariance(self) -> Float[Array, "unknowns unknowns"]:
         """Compute C as a matrix.
 
@@ -248,9 +232,8 @@ def _checked(errors: Float[Array, "..."], rounding: Float[Array, ""]) -> Float[A
     """Standard deviations or covariance, unless rounding makes them wrong by too much."""
     if not is_traced(rounding) and float(rounding) > PRECISION:
         raise InputError(
-            "standard deviations of the map-space form would have a relative error of "
-            f"{rounding:.1g} (accepted: {PRECISION:g}): the data are too precise for the normal "
-            "equations; use form=InData"
+            f"rounding would make standard deviations wrong by {rounding:.1g} (accepted: "
+            f"{PRECISION:g}): the data are too precise for normal equations; use form=InData"
         )
     return errors
 

@@ -193,8 +193,7 @@ class TimeBandedFactor(Factor):
     def colour(self, z):
         def step(window, row):
             left, diagonal, block = row
-            coloured = diagonal @ block + left @ window
-            return jnp.concatenate([window[len(block) :], block]), coloured
+            return jnp.concatenate([window[len(block) :], block]), diagonal @ block + left @ window
 
         return self._swept(step, self.diagonal, z)
 

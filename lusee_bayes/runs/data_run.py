@@ -342,10 +342,8 @@ class Averages:
         ]
         if self.bits is not None:
             fine, coarse = self.bits
-            said.append(
-                f"information about the map: {fine:.2f} bits -> {coarse:.2f} bits, "
-                f"{fine - coarse:.2g} lost"
-            )
+            lost = f"{fine - coarse:.2g} lost"
+            said.append(f"information about the map: {fine:.2f} bits -> {coarse:.2f} bits, {lost}")
         return tuple(said)
 
 

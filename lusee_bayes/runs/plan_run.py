@@ -179,10 +179,7 @@ def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str])
         key, _, listed = text.partition("=")
         values = parse_yaml(f"[{listed}]", f"--vary {text}")
         if not key or not isinstance(values, list) or not values:
-            raise InputError(
-                "--vary expects key.path=value,value,... (e.g. "
-                f"noise.radiometer.duty_cycle=0.25,0.5), got '{text}'"
-            )
+            raise InputError(f"--vary expects key.path=value,value (as seed=1,2), got '{text}'")
         for value in values:
             change = f"{key}={json.dumps(value, default=str)}"
             scenario = load_scenario(source, [*overrides, change])

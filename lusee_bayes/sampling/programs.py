@@ -360,8 +360,7 @@ def _blaming(who: str, doing: str) -> Iterator[None]:
 def _require_site(name: str, site: dict[str, Any], latent: bool, who: str) -> None:
     if not NAME.fullmatch(name):
         raise InputError(
-            f"{who} has a site '{name}'; use letters, digits, '_', '.' and '-', beginning with a "
-            "letter or '_'"
+            f"{who} has a site '{name}'; use letters, digits, '_', '.' and '-', a letter first"
         )
     if name in TAKEN or name.endswith(WHITE_SUFFIX):
         raise InputError(f"{who} has a site '{name}', a reserved name; rename it")

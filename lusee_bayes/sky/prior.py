@@ -333,16 +333,14 @@ class HarmonicPrior(DiagonalPrior):
         if (negative := np.asarray(self.spectrum) < 0).any():
             ell = int(np.argmax(negative))
             raise InputError(
-                f"the prior spectrum is negative at ell = {ell}: C_ell = "
-                f"{float(self.spectrum[ell]):.3g}; give a variance"
+                f"C_ell of the prior is {float(self.spectrum[ell]):.3g} at ell = {ell}: negative"
             )
         if self.mean is None:
             return
         fixed = np.flatnonzero((np.asarray(self.mean) != 0.0) & ~(np.asarray(self.variance()) > 0))
         if fixed.size:
             raise InputError(
-                f"the prior mean has power at ell = {int(np.sqrt(fixed[0]))}, where C_ell is zero; "
-                "give that ell a variance"
+                f"at ell = {int(np.sqrt(fixed[0]))} the prior has a mean, but no variance; give one"
             )
 
     def description(self) -> tuple[str, ...]:

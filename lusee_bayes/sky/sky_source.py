@@ -614,8 +614,7 @@ def read_sky_file(path: str | Path, dataset: str | None = None) -> SkyFile:
         if reader.recognises(path):
             return reader.read(path, dataset)
     raise InputError(
-        f"{path} is neither HDF5 nor FITS; give an ULSA HDF5, a HEALPix FITS map, or coefficients "
-        "(FITS or .npz)"
+        f"{path} is neither HDF5, FITS nor .npz; give an ULSA file, a HEALPix map or coefficients"
     )
 
 

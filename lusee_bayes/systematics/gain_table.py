@@ -119,9 +119,8 @@ class GainTable(Systematic):
             total = float(np.sqrt((slope[port == number] ** 2).sum(0)).max())
             if total > LARGEST:
                 raise InputError(
-                    f"the data give the power gain of port {number} a relative error of "
-                    f"{total:.2g}, expected at most {LARGEST:g}; "
-                    "noise.gain_table.treatment=ignored treats it as exact"
+                    f"the data give the power gain of port {number} an error of {total:.0%}, not "
+                    f"at most {LARGEST:.0%}; noise.gain_table.treatment=ignored treats it as exact"
                 )
         names = tuple(f"gain_{calibration.gain_names[k].replace(' ', '_')}" for k in used)
         return cls(names, tuple(port.tolist()), slope, setup.layout)

@@ -83,8 +83,8 @@ class SourceSection(Section):
         source = CATALOGUE.get(self.name)
         if source is None:
             raise InputError(
-                f"unknown source '{self.name}' without ra_deg and dec_deg; "
-                f"{nearest(self.name, [*CATALOGUE, *BODIES])}"
+                f"unknown source '{self.name}' without ra_deg and dec_deg;"
+                f" {nearest(self.name, [*CATALOGUE, *BODIES])}"
             )
         return galactic_unit_vector(source.ra_deg, source.dec_deg)
 

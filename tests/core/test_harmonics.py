@@ -125,8 +125,7 @@ def dense_generators(lmax):
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
 def test_a_turned_field_is_the_field_at_the_turned_back_direction(seed):
-    g = random_rotation(seed)
-    a = random_modes(seed)
+    g, a = random_rotation(seed), random_modes(seed)
     n = np.random.default_rng(seed).standard_normal((3, 50))
     n /= np.linalg.norm(n, axis=0)
 

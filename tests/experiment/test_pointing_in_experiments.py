@@ -196,8 +196,7 @@ def test_what_is_left_to_sample_is_about_the_offsets():
     gain = "noise.gain={sigma: 1e-9, treatment: sampled}"
     experiment = lb.build(scenario_of(far, gain, lmax=6, step_s=86400.0))
     model = program_pieces(experiment)["gaussian"]()
-    n = model.n_data
-    mean = model.condition(experiment.data.data).posterior.mean
+    n, mean = model.n_data, model.condition(experiment.data.data).posterior.mean
     assert float(model.chi2(mean, experiment.data.data)) < n + 4 * np.sqrt(2 * n)
 
 

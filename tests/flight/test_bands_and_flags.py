@@ -43,8 +43,7 @@ def test_noise_is_flagged_as_rarely_as_is_said():
 def test_lines_are_found_in_their_channel_alone(strength):
     rng = np.random.default_rng(2)
     spectra, band = autos(rng), band_of()
-    channel = rng.integers(band.first, band.last, ROWS)
-    rows = np.arange(ROWS)
+    channel, rows = rng.integers(band.first, band.last, ROWS), np.arange(ROWS)
     spectra[rows, :, channel] *= 1.0 + strength / np.sqrt(FRAMES)
     flagged, _ = flags_of(band, spectra)
     injected = np.zeros(flagged.shape, dtype=bool)
@@ -64,8 +63,7 @@ def test_several_lines_hide_none():
 @pytest.mark.parametrize("navgf", [1, 2])
 def test_a_comb_far_below_the_noise_of_a_channel_is_found(navgf):
     rng, averaging = np.random.default_rng(4), AVERAGING[navgf]
-    spectra = autos(rng, rows=40, navgf=navgf)
-    frames = np.full(40, FRAMES)
+    spectra, frames = autos(rng, rows=40, navgf=navgf), np.full(40, FRAMES)
     # neighbours predict a channel to fourth order: at 5 MHz, 6e-8 of it
     assert np.abs(fl.comb_strength(spectra, frames, averaging, MHZ)).max() < fl.COMB_LIMIT / 1.5
     spectra[::2, :, fl.comb_bins(averaging)] *= 1.0 + 1.0 / np.sqrt(FRAMES)
@@ -155,8 +153,7 @@ def test_noise_that_is_larger_than_expected_is_no_burst():
 
 
 def test_with_few_spectra_nothing_is_told():
-    t = 1800.0 * np.arange(40)
-    values = np.random.default_rng(1).random((40, 4))
+    t, values = 1800.0 * np.arange(40), np.random.default_rng(1).random((40, 4))
     found, scatter = fl.burst_flags(t, values, 1e-4 * values, np.ones(40, dtype=bool), FALSE_ALARM)
     assert not found.any()
     assert np.isnan(scatter).all()
@@ -217,8 +214,7 @@ def test_noise_of_steep_spectra_and_shared_channels_by_drawing_it():
     shared = shared_noise(1, "hann")
     band = ChannelBand.of(10.0, 1.0, 1, AVERAGING[2], channel_mhz("centre"), shared)
     n = band.last - band.first
-    shape = np.linspace(1.3, 0.7, n)[None]
-    good = np.ones((1, n), dtype=bool)
+    shape, good = np.linspace(1.3, 0.7, n)[None], np.ones((1, n), dtype=bool)
     good[0, 3:6] = False
     _, variance, _ = band.values(shape[:, None], shape, good)
     rng = np.random.default_rng(5)

@@ -118,8 +118,7 @@ def test_what_a_session_of_layout_4_says(newer):
     assert session.telemetry.keys() == set(NAMES[1:])
     for name, values in session.telemetry.items():
         np.testing.assert_allclose(values, layout_4.telemetry(name, RAW_S), rtol=1e-9)
-    utc = session.clock.utc(RAW_S)
-    elapsed = RAW_S - layout_4.SPECTROMETER_S
+    utc, elapsed = session.clock.utc(RAW_S), RAW_S - layout_4.SPECTROMETER_S
     np.testing.assert_allclose((utc - Time(layout_4.LANDING)).sec, elapsed, atol=1e-5)
     with session.spectra() as read:
         np.testing.assert_array_equal(read(1, 4), layout_4.counts()[1:4])

@@ -43,8 +43,7 @@ TURNTABLES = [pytest.param(16, 0.0, marks=pytest.mark.long), (8, 35.0)]
 
 @pytest.mark.parametrize(("lmax", "turntable"), TURNTABLES)
 def test_visibilities_agree_with_an_integral_over_the_sky_in_lunartopo(lmax, turntable):
-    frequency = 25.0
-    o = lb.Observation.from_runs([lb.Run(1.0, turntable)])
+    frequency, o = 25.0, lb.Observation.from_runs([lb.Run(1.0, turntable)])
     sky = steep_sky(lmax)
     got = CouplingMatrix.observe(lb.monopole_beams(frequency, lmax), o) @ sky
     got = np.asarray(got).reshape(16, -1)
@@ -98,8 +97,7 @@ def test_dense_rows_are_each_times_own_rotation(coupling):
     """V = b . D(topocentric <- galactic at t) a, with one dense rotation for every time."""
     o = two_runs()
     dense = np.asarray(coupling.dense()).reshape(16, o.n_times, -1)
-    a = steep_sky(LMAX, monopole=1.0)
-    beams = random_beams(1).modes
+    a, beams = steep_sky(LMAX, monopole=1.0), random_beams(1).modes
     topocentric = o.topocentric_from_mcmf() @ o.mcmf_from_galactic
     for k in (0, 5, o.n_times - 1):
         seen = Rotation.from_matrix(topocentric[k], LMAX)(a)

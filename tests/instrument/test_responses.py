@@ -127,8 +127,7 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     response = read_beam(write_response(tmp_path / "response.fits", varied, 3))
     f, part = 27.0, 0.35
     theta, phi, solid_angle = hemisphere(20, 40)
-    harmonics = real_harmonics(theta, phi, 3) * solid_angle[:, None]
-    open_ = []
+    harmonics, open_ = real_harmonics(theta, phi, 3) * solid_angle[:, None], []
     for k, mhz in enumerate((10.0, 20.0, 40.0)):
         lengths = zip(("H_theta", "H_phi"), effective_lengths(theta, phi), strict=True)
         images = {name: np.repeat(h[:, None] + 0j, 3, 1) for name, h in lengths}
@@ -378,8 +377,7 @@ def test_luseepys_four_ports_are_written_back(luseepy, tmp_path):
 
 def test_gaps_are_written(luseepy, tmp_path):
     response, original, _ = luseepy
-    waterfall = read_waterfall(original)
-    keep = np.arange(328) % 7 < 3
+    waterfall, keep = read_waterfall(original), np.arange(328) % 7 < 3
     grid = waterfall.grid[:, keep, :1].copy()
     grid[3, 2] = np.nan
     first = {name: getattr(waterfall, name)[:1] for name in ("frequencies_mhz", "per_kelvin")}

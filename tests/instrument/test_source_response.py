@@ -154,8 +154,7 @@ def around(n0, g, reach, n_radius, n_angle):
     cosine = 1 - root**2
     ring = w / 2 * np.sqrt(height) * 2 * root * 2 * np.pi / n_angle
     terms = ((2 * ell + 1) * g[ell] * eval_legendre(ell, cosine) for ell in range(len(g)))
-    kernel = sum(terms) / (4 * np.pi)
-    across = np.cross(n0, [0.0, 0.0, 1.0])
+    kernel, across = sum(terms) / (4 * np.pi), np.cross(n0, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
     other = np.cross(n0, across)
     alpha = 2 * np.pi * (np.arange(n_angle) + 0.5) / n_angle

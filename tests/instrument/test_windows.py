@@ -535,8 +535,7 @@ def test_middles_are_the_default_and_steps_may_be_shorter_than_the_times():
 def test_bounds_of_any_kind_of_times():
     bounds = [[s, s + timedelta(seconds=1000.0 + 100.0 * k)] for k, s in enumerate(STARTS)]
     words = [[one.isoformat() for one in pair] for pair in bounds]
-    stamps = np.array(bounds, dtype="datetime64[us]")
-    for one in (bounds, words, stamps, Time(bounds, scale="utc")):
+    for one in (bounds, words, np.array(bounds, dtype="datetime64[us]"), Time(bounds, scale="utc")):
         observation = made(bounds=one, live_s=np.full(4, 500.0)).observation
         start = HOUR * np.arange(4)
         expected = np.stack([start, start + 1000.0 + 100.0 * np.arange(4)], axis=1)

@@ -231,8 +231,7 @@ def model_of(n_data=60, prior="harmonic", seed=1):
 
 def drawn(model, rng, strength=1.0):
     """Data of a sky whose deviations from the prior mean are so many times the prior's."""
-    u = strength * rng.standard_normal(N_MODES)
-    mean = model.prior.white_mean
+    u, mean = strength * rng.standard_normal(N_MODES), model.prior.white_mean
     sky = model.prior.colour(jnp.asarray(u) if mean is None else u + mean)
     root = np.linalg.cholesky(np.asarray(model.noise.dense()))
     return model.predict(sky) + jnp.asarray(root @ rng.standard_normal(model.n_data))
@@ -451,8 +450,7 @@ def check(found: LeftOut, data, inverse, sky, u, groups, chosen=None):
     np.testing.assert_allclose(found.inverse_diagonal[present], np.diag(inverse), rtol=1e-6)
     for group in groups:
         inside = group[present]
-        block = inverse[np.ix_(inside, inside)]
-        missed = found.missed(group)
+        block, missed = inverse[np.ix_(inside, inside)], found.missed(group)
         assert missed.n == inside.sum()
         assert missed.chi2 == pytest.approx(u[inside] @ np.linalg.solve(block, u[inside]), rel=1e-6)
         # a difference of numbers of data, and of traces with condition numbers of 1e6

@@ -19,8 +19,7 @@ LMAX, N_MODES = 2, 9
 
 def skies(seed=0):
     """Power laws that bend, with a little of every channel's own; in K."""
-    rng = np.random.default_rng(seed)
-    x = np.log(FREQUENCIES / 20.0)[:, None]
+    rng, x = np.random.default_rng(seed), np.log(FREQUENCIES / 20.0)[:, None]
     tilt = -2.5 + 0.2 * rng.standard_normal(N_MODES) + 0.3 * x * rng.standard_normal(N_MODES)
     own = 0.02 * rng.standard_normal((len(x), N_MODES))
     return 100.0 * rng.standard_normal(N_MODES) * np.exp(tilt * x) * (1.0 + own)

@@ -50,8 +50,7 @@ def noise_terms(n_data: int):
 def well_scaled(n_data: int, noise="diagonal", spectrum=SPECTRUM, offset=None):
     """A model of order-one numbers and data drawn from it by numpy."""
     rng = np.random.default_rng(n_data)
-    a = rng.normal(size=(n_data, N_MODES))
-    n = noise_terms(n_data)[noise]
+    a, n = rng.normal(size=(n_data, N_MODES)), noise_terms(n_data)[noise]
     sky = rng.normal(size=N_MODES) * np.sqrt(per_mode(spectrum))
     d = a @ sky + rng.multivariate_normal(np.zeros(n_data), np.asarray(n.dense()))
     if offset is not None:
@@ -163,8 +162,7 @@ def instrument():
     coupling = lb.CouplingMatrix.observe(beams, lb.Observation.from_runs([lb.Run(0.015)]))
     assert coupling.shape == (64, 81)
     spectrum = jnp.asarray(1e8 * (1.0 + np.arange(lmax + 1.0)) ** -2.5)
-    monopole = jnp.zeros(81).at[0].set(2e4 * np.sqrt(4 * np.pi))  # 20000 K everywhere
-    fiducial = coupling.layout.scatter(coupling @ monopole)
+    fiducial = coupling.layout.scatter(coupling @ jnp.zeros(81).at[0].set(2e4 * np.sqrt(4 * np.pi)))
     noise = lb.radiometer_noise(fiducial, coupling.layout, form="exact")
     model = lb.LinearGaussian(coupling, lb.HarmonicPrior(spectrum), noise)
     return model, model.sample(jax.random.key(3))[1]

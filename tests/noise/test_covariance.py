@@ -76,8 +76,7 @@ def _terms(flags):
     for (a, (k, t)), (b, (j, s)) in product(enumerate(entries), repeat=2):
         if t == s:
             by_hand[a, b] = blocks[t, k, j]
-    matrix = random_covariance(rng, n)
-    updated = rng.uniform(0.5, 2.0, n)
+    matrix, updated = random_covariance(rng, n), rng.uniform(0.5, 2.0, n)
     base, (directions, outer) = lb.DiagonalCovariance(jnp.asarray(updated)), _directions(n)
     return {
         "diagonal": (lb.DiagonalCovariance(jnp.asarray(variance)), np.diag(variance)),

@@ -39,13 +39,11 @@ def by_the_papers_equation(d, hours, sigma, correlation, flags):
     """Appendix A, Eq. for Cov(e_ij(t), e_kl(t')), one entry at a time."""
     names = pairs(round(np.sqrt(len(d))))
     entries = [(p, t) for p in range(len(d)) for t in range(len(hours)) if not flags[p, t]]
-    kernel = c_g(hours, sigma, correlation)
-    cov = np.zeros((len(entries),) * 2)
+    kernel, cov = c_g(hours, sigma, correlation), np.zeros((len(entries),) * 2)
     for a, (p, t) in enumerate(entries):
         for b, (q, s) in enumerate(entries):
             (i, j), (k, m) = names[p], names[q]
-            c = kernel[t, s]
-            linear = (i == k) + (i == m) + (j == k) + (j == m)
+            c, linear = kernel[t, s], (i == k) + (i == m) + (j == k) + (j == m)
             quadratic = (i == k) * (j == m) + (i == m) * (j == k)
             cov[a, b] = d[p, t] * d[q, s] * c * (linear + c * quadratic)
     return cov

@@ -201,8 +201,7 @@ def test_their_covariance_is_that_of_the_exact_form():
     t = np.broadcast_to(one[..., None], (4, 4, DRAWS)).copy()
     drawn = to_real(sample_covariances(t, AVERAGED, rng))
     true = to_real(one[..., None])
-    block = np.asarray(exact_blocks(true))[0] / AVERAGED
-    found = np.cov(drawn)
+    block, found = np.asarray(exact_blocks(true))[0] / AVERAGED, np.cov(drawn)
     # a sample covariance of Gaussians scatters by this
     std = np.sqrt((block**2 + np.outer(block.diagonal(), block.diagonal())) / DRAWS)
     assert np.abs((found - block) / std).max() < 4.5

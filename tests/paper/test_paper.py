@@ -107,8 +107,7 @@ def test_a_real_run_at_tiny_size(tmp_path):
 
 @pytest.mark.long
 def test_an_interrupted_run_goes_on_where_it_stopped(four, tmp_path, computed, monkeypatch):
-    compute = runs.compute_case
-    uninterrupted = run_cases(tmp_path / "whole")
+    compute, uninterrupted = runs.compute_case, run_cases(tmp_path / "whole")
     scenarios = computed.copy()
     computed.clear()
 
@@ -220,8 +219,7 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
         # fidelity: everything poor and nothing of it where the paper has it
         rho = np.full(48, 0.8 if name in ("duty_cycle_50", "prior_x10") else 0.1)
         snr = np.full(48, 2.0 if name in ("beam_4MHz", "beam_0.4MHz", "duty_cycle_50") else 0.9)
-        power = np.ones(48)
-        mean = -2 * truth - (100 if frequency == 45 else 0)
+        power, mean = np.ones(48), -2 * truth - (100 if frequency == 45 else 0)
         altitude = np.ones(3072)
         data, noise = np.tile(data[:1, :100], (16, 1)), np.ones((16, 100))
         data = data / 1e5

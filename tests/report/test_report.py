@@ -66,8 +66,7 @@ CUBE = pytest.param("small_cube", marks=pytest.mark.long)
 @pytest.mark.parametrize("which", [MAP, CUBE, SAMPLED])
 def test_pages_are_whole_and_need_nothing_else(which, request):
     folder = request.getfixturevalue(which).folder
-    page = (folder / "report.html").read_text()
-    outline = Outline()
+    page, outline = (folder / "report.html").read_text(), Outline()
     outline.feed(page)
     assert outline.open == []
     assert len(outline.pictures) >= (4 if which == "small_cube" else 6)

@@ -99,8 +99,7 @@ def test_the_scatter_is_that_of_simulated_skies(ensemble):
 def test_skies_of_the_prior_are_covered_within_the_printed_errors(tmp_path):
     """Shares of four skies, the mean of their distances from the level in printed errors: 0 within
     1 / sqrt(4). With error bars that are 1.3 times too wide they are far from it."""
-    setup = set_up(small_scenario(lmax=24, cycles=1.0))
-    far = {1.0: [], 1.3: []}
+    setup, far = set_up(small_scenario(lmax=24, cycles=1.0)), {1.0: [], 1.3: []}
     for seed in range(4):
         sky = np.array(setup.prior.sample(jax.random.key(seed)))
         # antennas have to be warm

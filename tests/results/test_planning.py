@@ -126,8 +126,7 @@ def test_numbers_of_an_experiment_against_dense_algebra(cycles, systematic):
 
 
 def test_a_lost_antenna_is_flags():
-    variation = varied()
-    dead = [p.i == 2 or p.j == 2 for p in all_products()]
+    variation, dead = varied(), [p.i == 2 or p.j == 2 for p in all_products()]
     experiment = lb.build(variation.scenario)
     flags = np.repeat(np.array(dead)[:, None], experiment.setup.observation.n_times, axis=1)
     found = plan_run.forecast(replace(variation, lost=(2,)))
@@ -146,8 +145,7 @@ def test_a_lost_antenna_is_flags():
 
 def test_an_ell_that_is_not_seen_and_one_without_power():
     """Expected SNR^2 of 0 and NaN; neither is clipped."""
-    a = jnp.eye(9)[:4]
-    prior = lb.HarmonicPrior(jnp.asarray([0.0, 3.0, 2.0]))
+    a, prior = jnp.eye(9)[:4], lb.HarmonicPrior(jnp.asarray([0.0, 3.0, 2.0]))
     model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(4)))
     found = plan_run.expected_snr_squared(model.factorise(InMap).condition(jnp.zeros(4)).posterior)
     assert np.isnan(found[0])

@@ -168,8 +168,7 @@ def test_skies_that_are_alike_have_errors_that_are_alike():
     A measured mean is (1 - c) u + noise of variance c (1 - c), with the posterior variance c.
     """
     rng, rho, c = np.random.default_rng(3), 0.9, np.repeat([1e-4, 0.5, 0.95], [100, 50, 50])
-    row = rng.normal(size=200)
-    u = rng.normal(size=(4000, 2, 200))
+    row, u = rng.normal(size=200), rng.normal(size=(4000, 2, 200))
     u[:, 1] = rho * u[:, 0] + np.sqrt(1.0 - rho**2) * u[:, 1]
     means = (1.0 - c) * u + np.sqrt(c * (1.0 - c)) * rng.normal(size=u.shape)
     errors = np.cov(((means - u) @ row).T)

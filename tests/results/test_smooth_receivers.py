@@ -178,8 +178,7 @@ def test_simulated_receivers_have_the_covariance(response_file):
     assert np.abs(found - wanted).max() < 4.5 * np.sqrt(2 / n_seeds)
     assert np.abs(flat.mean(0)).max() < 4.0 / np.sqrt(n_seeds)
     # a smooth function: between 20 and 22 MHz, 0.1375 octaves apart, a third of what it varies by
-    steps = values[:, 1] - values[:, 2]
-    variance = 2.0 * (1.0 - wanted[4, 8])
+    steps, variance = values[:, 1] - values[:, 2], 2.0 * (1.0 - wanted[4, 8])
     assert steps.var() == pytest.approx(variance, rel=4 * np.sqrt(2 / (4 * n_seeds)))
 
 

@@ -85,8 +85,7 @@ def test_a_map_is_that_of_all_data(kind, tmp_path, exact_tilt):
 def test_a_stopped_run_does_not_go_on_with_other_earlier_data(tmp_path):
     """The folder is the same, its content is not."""
     scenario = lb.load_scenario("fiducial", [*SIZES, "frequencies_mhz=[20, 25]"])
-    whole = channels_of(scenario)
-    first, second = ([of_run(data, k) for data in whole] for k in (0, 1))
+    first, second = ([of_run(data, k) for data in channels_of(scenario)] for k in (0, 1))
     lb.run_map(scenario, tmp_path / "a", data=first)
     with pytest.MonkeyPatch.context() as patch:
         # the channels' files stay, as if the run had been stopped

@@ -81,8 +81,7 @@ class Command:
 
     def timed(self, folder: Path) -> float:
         """Run it to its end; seconds."""
-        process = self.start(folder)
-        start = time.monotonic()
+        process, start = self.start(folder), time.monotonic()
         errors = process.communicate(timeout=600)[1]
         assert process.returncode == 0, errors
         return time.monotonic() - start

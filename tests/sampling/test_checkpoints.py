@@ -91,8 +91,7 @@ def test_a_chunk_is_written_whole_or_not_at_all(folder, monkeypatch, moment):
     It is on the disk before it has its name: else a crash could leave the name with nothing in it.
     """
     before = {path.name: path.read_bytes() for path in chunks(folder)}
-    run = again(folder)
-    owner = hmc.np if moment == "savez" else hmc.os
+    run, owner = again(folder), hmc.np if moment == "savez" else hmc.os
     with monkeypatch.context() as patch:
         patch.setattr(owner, moment, raising(OSError("disk full")))
         with pytest.raises(OSError, match="disk full"):

@@ -46,8 +46,7 @@ def exact(setting):
 
 
 def chains_of(sites):
-    rng = np.random.default_rng(0)
-    shape = next(iter(sites.values())).shape[:2]
+    rng, shape = np.random.default_rng(0), next(iter(sites.values())).shape[:2]
     statistics = {name: rng.random(shape) for name in STATISTICS}
     return Chains(sites, statistics | {"diverging": rng.random(shape) > 0.5})
 

@@ -89,8 +89,7 @@ def test_coordinates_are_those_of_the_gaussian_given_all_channels(octaves):
         here = slice(4 * k, 4 * k + 4)
         seen[here, here], pulled[here] = rows.T @ rows, rows.T @ data
         known[name] = Amplitudes(covariance @ rows.T @ data, covariance, np.zeros((0, 4)))
-    x = np.log2(list(FREQUENCIES.values()))
-    prior = np.zeros((3, 4, 3, 4))
+    x, prior = np.log2(list(FREQUENCIES.values())), np.zeros((3, 4, 3, 4))
     prior[:, 0, :, 0] = 1.0
     prior[:, 1, :, 1] = np.exp(-0.5 * ((x[:, None] - x) / octaves) ** 2)
     prior[:, 2, :, 2] = prior[:, 3, :, 3] = np.eye(3)

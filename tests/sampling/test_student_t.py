@@ -24,8 +24,7 @@ FORMS = ["paper", "exact"]
 @pytest.fixture(scope="module", params=FORMS)
 def case(request):
     """Four products; a time without data, one with a single product, others with gaps."""
-    rng = np.random.default_rng(1)
-    flags = np.zeros((4, N_TIMES), dtype=bool)
+    rng, flags = np.random.default_rng(1), np.zeros((4, N_TIMES), dtype=bool)
     flags[:, 2] = flags[:3, 4] = flags[1, 5:] = True
     layout = DataLayout.from_flags(flags)
     visibilities = np.array([9.0, 2.0, -1.0, 16.0])[:, None] * rng.uniform(1.0, 2.0, N_TIMES)
@@ -150,8 +149,7 @@ def rms(x):
 @pytest.fixture(scope="module")
 def burst():
     """98 times of 16 products, 81 modes, every twentieth time with bursts of 1000 sigma."""
-    clean = small_experiment(lmax=8, cycles=0.3)
-    rng = np.random.default_rng(3)
+    clean, rng = small_experiment(lmax=8, cycles=0.3), np.random.default_rng(3)
     layout, noise = clean.data.layout, lb.infer(clean).model.noise
     bad = rng.choice(layout.n_times, round(0.05 * layout.n_times), replace=False)
     hit = np.isin(layout.time, bad)

@@ -43,8 +43,7 @@ class Truth:
     """A small model with correlated unknowns, conditioned by the package and by the textbook."""
 
     def __init__(self, form: type[Form]):
-        rng = np.random.default_rng(5)
-        n_data = 40 if form is InMap else 10
+        rng, n_data = np.random.default_rng(5), 40 if form is InMap else 10
         spectrum = np.array([100.0, 4.0, 1.0, 0.01])
         s = np.diag(np.repeat(spectrum, 2 * np.arange(LMAX + 1) + 1))
         a = rng.standard_normal((n_data, MODES))

@@ -181,7 +181,7 @@ BAD_MAPS = [
     ("COORDSYS is C, expected G", lambda to, x: write_fits(to, x, coord="C")),
     ("NaN or infinity: nan at .7", lambda to, x: write_fits(to, with_one(x, np.nan))),
     ("has the unit 'Jy', expected K", lambda to, x: write_fits(to, x, "Jy")),
-    ("neither HDF5 nor FITS", lambda to, x: to.write_text("not a map")),
+    ("neither HDF5, FITS nor", lambda to, x: to.write_text("not a map")),
     ("did you mean 'smooth_absorp'", lambda to, x: write_hdf5(to, smooth_absorp=x)),
     ("of a HEALPix map", lambda to, x: write_hdf5(to, smooth_absorb=x[:-1])),
 ]

@@ -125,8 +125,7 @@ def test_error_bars_of_all_together_are_right():
 @pytest.mark.parametrize(("mhz", "angles"), [(10.0, 1), (10.0, 2), (25.0, 1), (25.0, 2)])
 def test_all_are_found_together_at_full_resolution(test_data, mhz, angles):
     truth, found = of_another_sky(test_data, mhz, angles, lmax=16, seed=1)
-    away = pulls(truth, found)
-    full = rms_of_directions(found, truth.sky.modes)
+    away, full = pulls(truth, found), rms_of_directions(found, truth.sky.modes)
     assert not found.unsettled and found.rounds < 20
     assert 0.8 < full < 1.25
     assert max(map(abs, away.values())) < 3.5

@@ -57,15 +57,13 @@ def test_beams_are_those_of_fields_with_errors():
     """
     std, lmax = 1e-2, 4
     setup, errors, z = errors_of(f"lmax: 2, std: {std}")
-    values = errors.values(z)
-    grid = HemisphereGrid.gauss_legendre(48, 48)
+    values, grid = errors.values(z), HemisphereGrid.gauss_legendre(48, 48)
     theta, phi = (x.ravel() for x in np.meshgrid(grid.theta, grid.phi, indexing="ij"))
     of_ells = [values[f"field_error_{k}"].reshape(2, 4, 2, 2 * k + 1) for k in range(3)]
     real, imaginary = np.concatenate(of_ells, axis=3) @ real_harmonics(theta, phi, 2).T
     fields = setup.beam_source.fields(setup.frequency_mhz, grid)
     power = np.abs(np.asarray(fields.e_theta)) ** 2 + np.abs(np.asarray(fields.e_phi)) ** 2
-    weights = grid.weights[:, None] / grid.n_phi  # of means over the hemisphere
-    rms = np.sqrt((power * weights).sum((1, 2)))
+    rms = np.sqrt((power * (grid.weights[:, None] / grid.n_phi)).sum((1, 2)))
     more = (real + 1j * imaginary).reshape(4, 2, *power.shape[1:]) * rms[:, None, None, None]
     # East and North at the zenith, carried along great circles
     cos, sin = np.cos(grid.phi), np.sin(grid.phi)

@@ -430,7 +430,7 @@ BAD_TABLES = [
     ([BARE], UNNAMED, "give noise.gain_table.std"),
     ([TABLE % "marginalised"], NAMED, "gain table; remove noise.gain_table.std"),
     ([BARE, "flight={gain_std: 0.3}"], None, "flight.gain_std is 0.3, .* give a smaller noise"),
-    ([BARE], WIDE, "of port 1 a relative error of 0.11, expected at"),
+    ([BARE], WIDE, "of port 1 an error of 11%, not at most"),
 ]
 
 

@@ -161,8 +161,7 @@ def test_the_level_is_that_of_the_radiometer_only():
     with numpyro_promotion():
         given = handlers.substitute(program.model, {"noise_level": jnp.asarray(9.0)})(**arguments)
     term = (da * s) @ da.T + (t * std**2) @ t.T
-    expected = np.diag(9.0 * n) + term
-    got = np.asarray(given.noise.dense())
+    expected, got = np.diag(9.0 * n) + term, np.asarray(given.noise.dense())
     # the two terms hold up to 1e6 K^2 of which rounding leaves 1e-10 K^2, the radiometer 0.05
     within(got, expected, 1e-13 * term.max())
     assert np.abs(got - (np.diag(n) + term)).max() > 0.1

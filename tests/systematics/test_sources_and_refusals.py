@@ -159,8 +159,7 @@ def test_the_program_given_its_fluxes():
 
 def test_simulated_data_hold_the_drawn_fluxes():
     setup = setup_of()
-    truth = models.true_values(setup)
-    flux = np.concatenate([np.atleast_1d(truth[site]) for site in SITES])
+    flux = np.concatenate([np.atleast_1d(models.true_values(setup)[site]) for site in SITES])
     d = experiment().data
     t, a = columns(), np.asarray(setup.coupling.dense())
     sigma = np.sqrt(np.asarray(models.radiometer(setup).diagonal()))
@@ -270,8 +269,7 @@ COUNTED_TWICE = [
 @pytest.mark.parametrize(("program", "overrides", "section"), COUNTED_TWICE)
 def test_nothing_is_counted_twice(program, overrides, section):
     """What a program samples must not be in N as well."""
-    asked = lb.load_program(program)
-    e = experiment(*overrides, sources=CAS_A)
+    asked, e = lb.load_program(program), experiment(*overrides, sources=CAS_A)
     refuse(f"this unknown, too; set {section}.treatment=sampled", program_arguments, asked, e)
     # either of the other treatments will do
     for treatment in ("sampled", "ignored"):

@@ -51,8 +51,7 @@ def test_draws_estimate_the_trace():
         around = Around(sky=setup.sky.modes, values=values, volume=volume)
         return np.asarray(Expanded.at(antennas, model, around).expected)
 
-    got = expected((draws, draws @ a.T / noise, 0.0))
-    assert (np.abs(got - exact) < 4.0 * error).all()
+    assert (np.abs(expected((draws, draws @ a.T / noise, 0.0)) - exact) < 4.0 * error).all()
     assert (np.abs(exact) > 10.0 * error).any()
     # a small problem needs no draws; the differences have a step
     np.testing.assert_allclose(expected(rounds._volume(solution, 2)), exact, rtol=1e-4)

@@ -491,8 +491,7 @@ def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam")
     """
     if beam.beam_type != "efield":
         raise InputError(
-            f"{path} is a UVBeam of type {beam.beam_type}; give one of type efield, since the "
-            "crosses between ports need fields"
+            f"{path} is a UVBeam of type {beam.beam_type}; crosses need fields, type efield"
         )
     if (system := beam.pixel_coordinate_system) not in ("az_za", "healpix"):
         raise InputError(f"{path} has coordinates {system}; expected az_za or healpix")
