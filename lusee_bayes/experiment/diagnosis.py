@@ -341,7 +341,7 @@ class MixedProducts:
 
     def explains(self, base: ChiSquare) -> bool:
         """Whether one of these explains most of a large misfit."""
-        return min(chi2 for chi2, _ in self.plain()) < PROMISING * base.chi2
+        return bool(min(chi2 for chi2, _ in self.plain()) < PROMISING * base.chi2)
 
     def chi2(self, w: Columns) -> float:
         """chi^2 of (w, -1)."""

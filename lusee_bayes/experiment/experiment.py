@@ -403,7 +403,7 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
             )
     if learned is not None and learned.still_moves > 0.0:
         notes.append(
-            f"The prior did not converge: maps still move by {learned.still_moves:.2g} of their errors."
+            f"The prior did not converge: maps move by {learned.still_moves:.2g} of their errors."
         )
     if inference.unsettled:
         notes.append(inference.unsettled)

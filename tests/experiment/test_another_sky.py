@@ -218,9 +218,8 @@ def diagnosed(wrong, scenario=None):
     data = replace(wrong.make(scenario, sky(scenario.lmax), 1), truth=None)
     experiment = lb.build(scenario, data)
     found = lb.infer(experiment)
-    return (left := residuals(found.solution, data)), diagnosis.diagnose(
-        experiment.setup, found, left
-    )
+    left = residuals(found.solution, data)
+    return left, diagnosis.diagnose(experiment.setup, found, left)
 
 
 def is_named(wrong, found):
@@ -251,11 +250,8 @@ def test_the_cause_is_named(absent):
 def test_the_form_of_the_noise_is_named(right, wrong):
     right, wrong = (wrong_data.scenario(6, f"noise.radiometer.form={f}") for f in (right, wrong))
     data = wrong_data.measured(right, sky(6), 1)
-    experiment = lb.build(wrong, data)
-    found = lb.infer(experiment)
-    (first,) = diagnosis.diagnose(
-        experiment.setup, found, residuals(found.solution, data)
-    ).proposals
+    setup, found = (experiment := lb.build(wrong, data)).setup, lb.infer(experiment)
+    (first,) = diagnosis.diagnose(setup, found, residuals(found.solution, data)).proposals
     assert right.noise.radiometer.form in first.remedy and first.chi2.fits
 
 
@@ -266,6 +262,50 @@ def test_a_cause_is_named_even_if_the_simulated_sky_ends_at_lmax():
     _, found = diagnosed(wrong_data.WRONG[0], wrong_data.scenario(6, above))
     assert is_named(wrong_data.WRONG[0], found) and found.sentences()[0] == "Did you mean:"
     assert found.proposals[0].chi2.p < 1e-4
+
+
+# antennas one and a half, and half, of their standard deviations from the expected ones
+OFF = "beam.surface_permittivity=3.98", "beam.zenith_angle_deg=75.3"
+NOTHING = wrong_data.Wrong("nothing", "", wrong_data.measured)
+PLAIN = "imaginary parts conjugated", "ports 0 and 2 exchanged", "one time 50 % too low"
+
+
+def of_other_antennas(wrong):
+    """Data of antennas that are not the expected ones, and the default scenario for measured data.
+
+    The sky ends at lmax, but the model does not.
+    """
+    above = "noise.above_lmax={margin: 8, least_lmax: 0}"
+    scenario = wrong_data.scenario(6, "observation.step_s=30000", above)
+    data = wrong.make(wrong_data.changed(scenario, *OFF), sky(6), 1)
+    return replace(data, truth=None), scenario.of_measured()
+
+
+@pytest.mark.parametrize("wrong", [NOTHING, *(w for w in wrong_data.WRONG if w.name in PLAIN)])
+def test_a_mistake_is_told_from_unknown_antennas(wrong):
+    data, scenario = of_other_antennas(wrong)
+    setup = set_up(scenario, data)
+    assert diagnosis.is_mistaken(setup, Around(data)) == (wrong is not NOTHING)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("imaginary parts conjugated", marks=pytest.mark.essential),
+        pytest.param("33R 1 % too high", marks=pytest.mark.long),
+    ],
+)
+def test_unknown_antennas_do_not_absorb_a_mistake(name):
+    """They could: with fields and a sky above lmax, both learned, conjugated data fit."""
+    (wrong,) = (one for one in wrong_data.WRONG if one.name == name)
+    data, scenario = of_other_antennas(wrong)
+    experiment = lb.build(scenario, data)
+    kept = "The instrument is kept as expected" in " ".join(experiment.doubts)
+    assert kept == (name in PLAIN)
+    left = residuals((found := lb.infer(experiment)).solution, data)
+    assert left.level() == "does not fit"
+    named = diagnosis.diagnose(experiment.setup, found, left)
+    assert is_named(wrong, named) and named.sentences()[0] == "Explains most of the misfit:"
 
 
 @pytest.mark.long
@@ -309,7 +349,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
     setup = set_up(scenario, data)
     model = lb.infer(lb.build(scenario, data)).model
     spectrum = 1e2 * np.asarray(setup.sky.spectrum())
-    here = diagnosis.UnderAnySky(setup, data, model, spectrum)
+    here = diagnosis.UnderAnySky(setup, Around(data), model, spectrum)
     base, solution = here.wide(model.coupling)
     a, s = np.asarray(model.coupling.dense()), np.asarray(lb.HarmonicPrior(spectrum).variance())
     inverse = np.linalg.inv(a @ np.diag(s) @ a.T + np.asarray(model.noise.dense()))
