@@ -179,7 +179,7 @@ def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: T
     if given is not None and given.stated is not None:
         if said is None:
             raise InputError(
-                f"{path} has no UTC of {given.source}; give it clocks, not stated_utc_isot"
+                f"{path} contains no UTC of {given.source}: give clocks, not stated_utc_isot"
             )
         since_s = float(times.seconds_from(said.utc(np.array([said.raw_s]))[0], given.stated))
         raw_s = said.raw_s + since_s / said.rate

@@ -295,7 +295,7 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
         if times_b[0] <= times_a[-1]:
             raise InputError(
                 f"{a.path} ({times_a[0].isot[:19]} to {times_a[-1].isot[:19]}) and {b.path} "
-                f"({times_b[0].isot[:19]} to {times_b[-1].isot[:19]}) overlap; give spectra once"
+                f"({times_b[0].isot[:19]} to {times_b[-1].isot[:19]}) overlap in time; drop one"
             )
     ordered = tuple(s for s, _ in timed)
     lon, lat = _site(ordered) if recipe.site is None else recipe.site

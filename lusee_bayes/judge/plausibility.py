@@ -60,7 +60,7 @@ def require_plausible(data: Visibilities, signal: Grid, std: DataVector) -> tupl
     _refuse(
         data,
         np.isin(np.arange(len(values)), autos)[:, None] & (values < -SIGNIFICANT * sigma),
-        "a clearly negative auto-correlation; check signs and order of products, or flag it (NaN)",
+        "a significantly negative auto; check signs and order of the products, or flag it (NaN)",
     )
     return (*_about_range(values[autos], modelled[autos]), *_about_crosses(data, values, sigma))
 

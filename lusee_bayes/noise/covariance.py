@@ -161,7 +161,7 @@ class Covariance(checks.Described, eqx.Module):
     def __add__(self, other: Covariance) -> Covariance:
         if self.size != other.size:
             raise InputError(
-                f"cannot add covariances of {self.size} and {other.size} data: use the same data"
+                f"cannot add covariances of {self.size} and {other.size} data; build both alike"
             )
         total = self.absorb(other)
         total = other.absorb(self) if total is None else total

@@ -246,7 +246,7 @@ def test_a_second_file_as_the_true_beams(tmp_path):
 NOT_OF_A_FILE = [
     (["beam.length_m=2"], "length_m belongs to model monopole, not to luseepy"),
     (["noise.beam={parameters: {length_m: 0.1}}"], "which beam.file replaces"),
-    (["sky.sources=false", "sources.list=[{name: Cas A}]"], "exact beams of the embedded"),
+    (["sky.sources=false", "sources.list=[{name: Cas A}]"], "needs exact embedded beams"),
     (["noise.beam={shift_mhz: 1, file: some.fits}"], "give either shift_mhz, file or param"),
 ]
 

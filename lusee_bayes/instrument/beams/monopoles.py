@@ -372,7 +372,7 @@ def beams_towards(
         length = np.linalg.norm(np.asarray(directions), axis=1)
         if (bad := np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)).size:
             raise InputError(
-                f"directions must have length 1, number {bad[0]} has {length[bad[0]]:.6g}"
+                f"directions must be unit vectors, number {bad[0]} has length {length[bad[0]]:.6g}"
             )
     monopoles = Monopoles() if monopoles is None else monopoles
     # an array: one compilation for all frequencies
