@@ -242,11 +242,11 @@ def fitting(
             break
         flagged, blamed = more
         gone, groups = gone | flagged, (*groups, *blamed)
+        share = rules.count(gone) / n
         stages.say(
-            f"  lmax={setup.scenario.lmax}, round {rounds}: {rules.count(gone)} of {n} flagged"
+            f"  times compared at lmax={setup.scenario.lmax}, round {rounds}: {share:.2%} bad"
         )
         if not flagged.any():
-            share = rules.count(gone) / n
             remark = " ".join(filter(None, [rules.remark(gone, groups, share), kept]))
             return Fitting(gone, remark, share)
     return Fitting(nothing, f"{TOO_MANY} {kept}".strip())
