@@ -70,7 +70,7 @@ class ChiSquare:
     @computed_field
     @property
     def p(self) -> float:
-        """Two-sided p-value: uniform from 0 to 1 if the model is correct; NaN of NaN."""
+        """Two-sided p-value: uniform from 0 to 1 if the model is correct; NaN of less than 0."""
         tails = special.chdtr(self.degrees, self.chi2), special.chdtrc(self.degrees, self.chi2)
         # both are one half at the median, up to rounding
         return float(np.minimum(1.0, 2.0 * np.minimum(*tails)))

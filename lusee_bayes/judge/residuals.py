@@ -24,8 +24,6 @@ from lusee_bayes.judge.left_out import KINDS, DataGroup, LeftOut, Missed, groups
 from lusee_bayes.judge.split import Split, with_sky
 from lusee_bayes.linear.linear_gaussian import Solution
 
-# a group whose chi^2 exceeds that of all data by this factor is lost in rounding
-LOST = 1.01
 # if the sky is inconsistent with the prior
 TOO_WIDE = (
     "The prior is wider than the sky requires: error bars are too wide where the sky is fainter "
@@ -156,7 +154,10 @@ class Residuals:
     def _blame(self, truncated: bool) -> list[str]:
         """Which groups stand out and, unless lmax is too low, which to exclude."""
         if not self.compared():
-            return ["Products, days and angles are untested: rounding, or noise couples times."]
+            return [
+                "Products, days and turntable angles were not tested: rounding hides their chi2, or "
+                "the noise couples different times, so that the test would need all of A."
+            ]
         parts, extremes, suspects = [], self.extremes(), self.suspects()
         if (suspects or truncated) and extremes:
             named = in_brief([f"{group} (p {probability(group.p)})" for group in extremes])
@@ -209,8 +210,8 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
     def judged(group: DataGroup, missed: Missed) -> Group:
         n, own, others_p = missed.n, whole, np.nan
         if n < model.n_data:
-            chi2 = missed.chi2 if missed.chi2 < LOST * whole.chi2 else np.nan
-            own = ChiSquare(chi2, n - with_sky(n - missed.degrees))
+            own = ChiSquare(missed.chi2, n - with_sky(n - missed.degrees))
+            # NaN if own is larger, which rounding causes
             others_p = ChiSquare(whole.chi2 - own.chi2, whole.degrees - own.degrees).p
         return Group(group.kind, group.name, n, own.degrees, own.chi2, own.p, others_p)
 

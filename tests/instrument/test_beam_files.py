@@ -161,8 +161,7 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     beam = read_beam(write(tmp_path / "beam.fits"))
     angles = (0.0, 33.0)
     theta, phi, solid_angle = hemisphere(40, 90)
-    harmonics = real_harmonics(theta, phi, 4) * solid_angle[:, None]
-    crossed = {}
+    harmonics, crossed = real_harmonics(theta, phi, 4) * solid_angle[:, None], {}
     for f in (20.0, 30.0):
         fields = [point_pattern(theta, phi - np.radians(angle), f) for angle in angles]
         arms = [np.array([e.ravel() for e in field]) for field in fields]

@@ -179,8 +179,7 @@ RARELY_THERE = [
 @pytest.mark.parametrize(("absent", "kept", "lost"), RARELY_THERE)
 def test_products_that_are_rarely_there_are_left_out(absent, kept, lost):
     data = flagged(*absent)
-    found = averaged(data, 4 * STEP)
-    expected = data.grid()[:, kept].mean(axis=1)
+    found, expected = averaged(data, 4 * STEP), data.grid()[:, kept].mean(axis=1)
     expected[lost] = np.nan
     np.testing.assert_allclose(found.grid()[:, 0], expected, rtol=1e-12)
     assert found.observation.live_s == pytest.approx(len(kept) * STEP)
@@ -550,8 +549,7 @@ def test_bounds_of_any_kind_of_times():
 def test_rounded_times_make_no_overlaps():
     """Julian dates in one number are exact to 4e-5 s, so that half of the steps are too short."""
     starts = Time(START, scale="utc") + 60.0 * np.arange(400) * u.s
-    rounded = Time(starts.jd, format="jd", scale="utc")
-    data = np.zeros((400, 16))
+    rounded, data = Time(starts.jd, format="jd", scale="utc"), np.zeros((400, 16))
     edges = np.random.default_rng(1).uniform(-2e-5, 2e-5, (400, 2))
     edges = starts[:, None] + (edges + np.array([0.0, 60.0])) * u.s
     step = {"step_s": 60.0}

@@ -28,8 +28,7 @@ TOL = 1e-10
 
 def random_parts():
     """Models of two data sets of one sky, whose noise has no structure, and their data."""
-    rng = np.random.default_rng(4)
-    prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM))
+    rng, prior = np.random.default_rng(4), lb.HarmonicPrior(jnp.asarray(SPECTRUM))
     models, data = [], []
     for n in (20, 7):
         noise = DenseCovariance(jnp.asarray(random_covariance(rng, n)))

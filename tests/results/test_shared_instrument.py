@@ -264,8 +264,7 @@ def test_temperatures_of_all_channels_are_those_of_one_gaussian(cube, expected, 
     known = 3 * N_MODES + np.arange(2)
     cross = expected.covariance[np.ix_(at, known)]
     gone = cross @ np.linalg.solve(expected.covariance[np.ix_(known, known)], cross.T)
-    gone = np.diagonal(gone) / expected.std[at] ** 2
-    share = spectrum.shares[:, k]
+    gone, share = np.diagonal(gone) / expected.std[at] ** 2, spectrum.shares[:, k]
     np.testing.assert_allclose(share[spectrum.sources.index("the beams")], gone, rtol=1e-4)
     assert not share[spectrum.sources.index("the sources")].any()
     # its errors at two frequencies are alike

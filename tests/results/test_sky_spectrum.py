@@ -60,8 +60,7 @@ def test_index_and_turnover_are_those_of_a_parabola():
 
 def test_rows_average_the_pixels_of_a_map():
     rng = np.random.default_rng(1)
-    inside = rng.random((2, healpy.nside2npix(8))) < 0.2
-    sky = rng.normal(size=36)
+    inside, sky = rng.random((2, healpy.nside2npix(8))) < 0.2, rng.normal(size=36)
     means = [modes_to_map(sky, 8)[one].mean() for one in inside]
     within(averaging_rows(inside, 5) @ sky, means, 1e-12)
 

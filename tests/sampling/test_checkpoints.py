@@ -73,8 +73,7 @@ def test_chunks_are_in_the_order_of_their_iterations(tmp_path):
 
 def test_what_a_kill_left_half_written_is_ignored(folder):
     """The scratch file of a later chunk, cut in the middle, beside the marker's scratch file."""
-    half = chunks(folder)[-1].read_bytes()[:500]
-    later = N_DRAWS * (N_CHUNKS + 2)
+    half, later = chunks(folder)[-1].read_bytes()[:500], N_DRAWS * (N_CHUNKS + 2)
     (folder / f".chunk-{later:08d}.npz.123.partial").write_bytes(half)
     (folder / ".run.json.123.partial").write_text("{")
     run = again(folder)

@@ -72,8 +72,7 @@ def test_pixels_do_not_depend_on_how_many_are_held_at_once(skies, monkeypatch):
 
 
 def test_quantities_against_direct_computation(skies):
-    few = skies[:, :5]
-    places = {"somewhere": (33.0, -21.0), "pole": (0.0, 90.0)}
+    few, places = skies[:, :5], {"somewhere": (33.0, -21.0), "pole": (0.0, 90.0)}
     found = sky_quantities(few, modes=[(0, 0), (2, -1), (3, 3)], ells=[0, 2, 3], pixels=places)
     assert list(found) == [
         "T(somewhere) [K]", "T(pole) [K]", "C_0 [K2]", "C_2 [K2]", "C_3 [K2]",

@@ -301,8 +301,7 @@ def test_the_program_of_gain_scales():
     drifts = GainDrifts.build(setup.scenario.noise.gain, setup, Around(data))
     around = np.asarray(drifts.visibilities)
     c = sigma**2 * np.exp(-0.5 * ((hours[:, None] - hours) / correlation_h) ** 2)
-    n_times = len(hours)
-    noise = np.diag(np.asarray(radiometer(setup).diagonal()))
+    n_times, noise = len(hours), np.diag(np.asarray(radiometer(setup).diagonal()))
     for x, p in enumerate(products):
         for y, q in enumerate(products):
             shared = [(p.i == q.i) + (p.i == q.j) + (p.j == q.i) + (p.j == q.j)]
