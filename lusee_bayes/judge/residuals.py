@@ -155,8 +155,8 @@ class Residuals:
         """Which groups stand out and, unless lmax is too low, which to exclude."""
         if not self.compared():
             return [
-                "Products, days and turntable angles were not tested: rounding hides their chi2, or "
-                "the noise couples different times, so that the test would need all of A."
+                "Products, days and turntable angles were not tested: rounding hides their chi2, "
+                "or the noise couples different times, so that the test would need all of A."
             ]
         parts, extremes, suspects = [], self.extremes(), self.suspects()
         if (suspects or truncated) and extremes:
