@@ -56,8 +56,7 @@ def hemisphere(n_theta, n_phi):
 def sphere(n_theta, n_phi, lowest=-1.0):
     """The same of the whole sphere, or down to a cosine: Gauss nodes in it, equal steps in phi."""
     x, w = np.polynomial.legendre.leggauss(n_theta)
-    half = (1.0 - lowest) / 2.0
-    phi = 2.0 * np.pi * (np.arange(n_phi) + 0.5) / n_phi
+    half, phi = (1.0 - lowest) / 2.0, 2.0 * np.pi * (np.arange(n_phi) + 0.5) / n_phi
     grid = np.meshgrid(np.arccos(1.0 + half * (x - 1.0)), phi, indexing="ij")
     theta, phi = (a.ravel() for a in grid)
     return theta, phi, np.repeat(w * half, n_phi) * 2.0 * np.pi / n_phi

@@ -117,7 +117,7 @@ def build(
     stages = stages or Stages()
     experiment = _fitting(observed(scenario, data, stages), stages)
     start = Around(experiment.data, values=values)
-    return _learned(_searchable(experiment, start, stages), start, stages, earlier)
+    return _learned(*_searchable(experiment, start, stages), stages, earlier)
 
 
 def observed(
@@ -171,19 +171,16 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     return replace(experiment, setup=setup, data=kept, doubts=doubts, fitting=fit)
 
 
-def _searchable(experiment: Experiment, start: Around, stages: Stages) -> Experiment:
+def _searchable(experiment: Experiment, start: Around, stages: Stages) -> tuple[Experiment, Around]:
     """Keep the instrument as expected if the data contain a mistake that it could absorb."""
     setup, sampled = experiment.setup, experiment.scenario.samples
     if sampled or not (setup.measured and rounds.first_order(setup.scenario)):
-        return experiment
+        return experiment, start
     with stages("usual mistakes"):
         if not is_mistaken(setup, start):
-            return experiment
-    words = (
-        "A mistake in the data explains most of the misfit. The instrument is kept as expected: "
-        "its unknowns would absorb part of this mistake."
-    )
-    return replace(experiment, setup=rounds.as_expected(setup), doubts=(*experiment.doubts, words))
+            return experiment, start
+    words = "A mistake explains most of the misfit, and the instrument's unknowns stay as expected."
+    return replace(experiment, doubts=(*experiment.doubts, words)), replace(start, still=True)
 
 
 def _learned(
@@ -191,7 +188,7 @@ def _learned(
 ) -> Experiment:
     setup = experiment.setup
     if setup.family is None:
-        if start.values is None:
+        if start.values is None and not start.still:
             return experiment
         return replace(experiment, inference=rounds.settled(setup, start))
     with rounds_of(experiment, stages, "prior") as report:

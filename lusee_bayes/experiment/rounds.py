@@ -223,7 +223,8 @@ def settled(
     setup : Setup
     start : Around
         The data, and the expansion point of N in the first round. If the instrument is inferred and
-        no sky is given, the sky is solved for the given or else the expected values.
+        no sky is given, the sky is solved for the given or else the expected values. If ``still``,
+        the first round is the last.
     learn : callable, optional
         ``learn(information, start)`` learns the prior during the rounds: first when they have
         nearly converged, last when it moves the map by less than 0.05 standard deviations.
@@ -244,7 +245,7 @@ def settled(
     # a start with a sky is the result of other rounds
     report, ways = report or (lambda rounds, remark: None), OTHER_WAYS * (start.sky is None)
     if start.sky is None:
-        if (few := _fewer(setup, start)) is not None:
+        if not start.still and (few := _fewer(setup, start)) is not None:
             inference, step = _nearby(few[0], _beginning(*few), report, ways)
             # if some of the data do not fit, neither do all
             ways = OTHER_WAYS if inference.fits else 0
@@ -254,7 +255,8 @@ def settled(
             start = replace(start, values={n: v for n, v in values if n not in fixed})
         start = _beginning(setup, start)
     inference, step = _nearby(setup, start, report, ways)
-    moves, n_learned, learned, in_rounds, idle = np.inf, 0, None, rebuilds(setup), 0
+    in_rounds = rebuilds(setup) and not start.still
+    moves, n_learned, learned, idle = np.inf, 0, None, 0
     while True:
         last = not in_rounds or inference.rounds >= MAX_ROUNDS or idle == IDLE
         at_rest = moves < SETTLED
@@ -305,7 +307,7 @@ def _nearby(setup: Setup, around: Around, report: Report, ways: int) -> tuple[In
     best, step = _approached(setup, around, report)
     stuck = int(best.around.tempered > 1.0)
     for way in range(ways):
-        if best.moving and not best.fits and stuck < STUCK:
+        if best.moving and not (around.still or best.fits) and stuck < STUCK:
             other = _approached(setup, _elsewhere(setup, best, way), report)
             stuck += other[0].around.tempered > 1.0
             if other[0].posterior.log_evidence > best.posterior.log_evidence:
@@ -316,7 +318,7 @@ def _nearby(setup: Setup, around: Around, report: Report, ways: int) -> tuple[In
 def _approached(setup: Setup, around: Around, report: Report) -> tuple[Inference, _Step]:
     """Run rounds until the map has nearly converged; also return the last step."""
     inference, step, factors = _conditioned(setup, around, 1, None), _Step(), []
-    moves, stalled = np.inf if rebuilds(setup) else 0.0, False
+    moves, stalled = np.inf if rebuilds(setup) and not around.still else 0.0, False
     while moves > NEARLY and not stalled and inference.rounds < MAX_TEMPERED_ROUNDS:
         around, step, exact = _around(setup, inference, step)
         mean, n, excess = inference.posterior.mean, inference.rounds + 1, inference.excess
@@ -450,7 +452,8 @@ def _beginning(setup: Setup, around: Around) -> Around:
     if not first_order(setup.scenario):
         return around
     exact = _exact(setup, around)
-    return replace(exact.around, tempered=_tempered(exact.misfit(), 0))
+    rounds = MAX_TEMPERED_ROUNDS * around.still
+    return replace(exact.around, tempered=_tempered(exact.misfit(), rounds))
 
 
 def _exact(setup: Setup, around: Around) -> Inference:
@@ -576,7 +579,7 @@ def with_learned_prior(
         coarse, learned = first_learned(plain, whole(result.solution.information))
         start = result.around
         # data that do not fit say nothing about the sky above lmax
-        if learned.settled and learned.noise_factor < MOST_RAISED:
+        if learned.settled and learned.noise_factor < MOST_RAISED and not start.still:
             family = setup.above.family
             if surveys:
                 top = setup.scenario.noise.above_lmax.top(setup.scenario.lmax)

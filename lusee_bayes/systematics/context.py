@@ -272,6 +272,8 @@ class Around:
         before there is a posterior.
     tempered : float
         Factor of radiometer noise in first rounds; above 1, its products are independent.
+    still : bool
+        Whether values stay where they are, in one round.
     gains, gain_slope : (antennas, times) arrays or None
         Drifts of the gains, and the slope of ln p by them that is due to the volume of skies and
         drifts that fit; None before they are inferred.
@@ -283,6 +285,7 @@ class Around:
     values: Mapping[str, float | Float[Array, "..."]] | None = None
     volume: Volume | None = None
     tempered: float = 1.0
+    still: bool = False
     gains: Float[Array, "antennas times"] | None = None
     gain_slope: Float[Array, "antennas times"] | None = None
 

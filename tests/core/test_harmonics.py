@@ -148,8 +148,7 @@ def test_agreement_with_healpy():
 
 
 def test_inverse_identity_and_leading_axes():
-    d = h.Rotation.from_matrix(random_rotation(7), TURNED)
-    a = random_modes(7, 2, 3)
+    d, a = h.Rotation.from_matrix(random_rotation(7), TURNED), random_modes(7, 2, 3)
     within(d.T(d(a)), a, 1e-12)
     within(d(a)[1, 2], d(a[1, 2]), 1e-14)
     within(h.Rotation.from_matrix(np.eye(3), TURNED)(a), a, 1e-13)  # rounding of V V^H

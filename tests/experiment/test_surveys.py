@@ -142,8 +142,7 @@ def test_several_surveys_share_scale_and_zero_level():
     """T is their mean; each of them, and the embedded template, is one of the possible skies."""
     rng, n = np.random.default_rng(5), n_modes(6)
     plain = embedded_local_scales(25.0, 6)
-    skies = plain.mean * (1.0 + 0.1 * rng.standard_normal((2, n)))
-    beam = np.ones(n)
+    skies, beam = plain.mean * (1.0 + 0.1 * rng.standard_normal((2, n))), np.ones(n)
     surveys = [Survey("s", sky, beam, std, 1e3) for sky, std in zip(skies, (0.1, 0.2), strict=True)]
     family = embedded_local_scales(25.0, 6, surveys=surveys)
     np.testing.assert_allclose(family.mean, skies.mean(0), rtol=1e-12)

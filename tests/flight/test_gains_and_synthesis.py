@@ -40,8 +40,7 @@ def write_folder(folder, made, model="quadratic"):
     lines = ["gain_setting,component,model,term,alpha_refit"]
     for i, level in enumerate("LMH"):
         for port in range(4):
-            name = f"{level}{port}"
-            vectors = np.zeros((len(ANCHORS), len(ANCHORS)))
+            name, vectors = f"{level}{port}", np.zeros((len(ANCHORS), len(ANCHORS)))
             vectors[:, :2] = made.components[i, port].T
             np.save(folder / f"{name}_mean.npy", made.mean[i, port])
             np.save(folder / f"{name}_freqs.npy", made.anchor_mhz[i, port])

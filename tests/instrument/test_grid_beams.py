@@ -100,8 +100,7 @@ def test_beams_at_files_are_those_of_the_files_and_the_contract_holds(tables):
     assert section.source().n_ports == 4
     assert grid.values == pytest.approx(named(*MIDDLE))
     for place, source in zip(places, grid.sources, strict=True):
-        here = grid.with_values(named(*place))
-        modes = source.beams(MHZ, LMAX).modes
+        here, modes = grid.with_values(named(*place)), source.beams(MHZ, LMAX).modes
         np.testing.assert_allclose(here.beams(MHZ, LMAX).modes, modes, atol=1e-13)
         np.testing.assert_allclose(here.background(MHZ), source.background(MHZ), atol=1e-10)
     own = {"values": named(3.5, 74.0), "moon_temperature_k": 0.0}

@@ -80,8 +80,7 @@ def volts(response, frequency, kelvin) -> np.ndarray:
 @pytest.mark.parametrize("channel", range(4))
 def test_all_products_in_volts(luseepy, test_data, channel):
     """luseepy transforms the patterns in single precision (6e-8 each)."""
-    frequency = FREQUENCIES[channel]
-    expected = luseepy[2]["data"][:, :, channel].T
+    frequency, expected = FREQUENCIES[channel], luseepy[2]["data"][:, :, channel].T
     every = np.ones(expected.shape[1], dtype=bool)
     # the first sample, where a fixed axis is no approximation, and all about the first one's axis
     assert off(simulated(luseepy, test_data, frequency, ~every | (np.arange(328) == 0)),

@@ -29,8 +29,7 @@ RUNS = [lb.Run(0.5), lb.Run(0.3, 35.0), lb.Run(0.4)]
 
 def setting(order=2, missing=True, step_s=40000.0):
     """A coupling matrix of random beams; some samples, and all of one time, are missing."""
-    rng = np.random.default_rng(3)
-    o = lb.Observation.from_runs(RUNS, step_s=step_s)
+    rng, o = np.random.default_rng(3), lb.Observation.from_runs(RUNS, step_s=step_s)
     flags = np.zeros((N_PRODUCTS, o.n_times), dtype=bool)
     if missing:
         flags[1, 4], flags[:, 9], flags[0, -1] = True, True, True

@@ -62,8 +62,7 @@ def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
     commands += f"told.pixels = {points}.map((p) => viewer.pixel(...p));"
     found = run_page(page, tmp_path, commands)
     np.testing.assert_array_equal(found["pixels"], healpy.ang2pix(64, lon, lat, lonlat=True))
-    told = found["at"]
-    icrs = SkyCoord(lon, lat, unit="deg", frame="galactic").icrs
+    told, icrs = found["at"], SkyCoord(lon, lat, unit="deg", frame="galactic").icrs
     found = SkyCoord([x["ra"] for x in told], [x["dec"] for x in told], unit="deg")
     # the rotation is kept with 16 digits; asin near the poles loses half of them
     assert found.separation(icrs).max() < 1e-5 * u.deg

@@ -47,8 +47,7 @@ def bits(*overrides, lost=()):
 def simulated(variation):
     """The model of a variation, a posterior, and 200 skies with the means of their maps."""
     model = full_model(set_up(variation.scenario))
-    solver = model.factorise()
-    skies = model.prior.sample(jax.random.key(3), N_SETS)
+    solver, skies = model.factorise(), model.prior.sample(jax.random.key(3), N_SETS)
     signals = skies @ model.coupling.dense().T
     noise = map(model.noise.sample, jax.random.split(jax.random.key(4), N_SETS))
     posteriors = [solver.condition(s + n).posterior for s, n in zip(signals, noise, strict=True)]

@@ -93,8 +93,7 @@ def test_a_sky_that_does_not_end_at_lmax_has_error_bars_that_are_right(prior):
     given = "lmax=8", f"prior={{model: {prior}}}", "observation.step_s=14400"
     reach = "margin: 12, least_lmax: 0"
     sky = f"noise.above_lmax={{{reach}, treatment: ignored}}"
-    data = simulate(set_up(lb.load_scenario("fiducial", [*given, sky])))
-    found = []
+    data, found = simulate(set_up(lb.load_scenario("fiducial", [*given, sky]))), []
     for above in (f"{{{reach}}}", "null"):
         own = lb.load_scenario("fiducial", [*given, f"noise.above_lmax={above}"])
         posterior = lb.infer(lb.build(own, data)).posterior

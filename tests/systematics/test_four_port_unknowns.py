@@ -168,8 +168,7 @@ PORTS = np.array([0, 0, 0, 1, 2])
 def slopes(n_times: int) -> np.ndarray:
     """Two components at one level of port 0 and another level after it; port 3 has no error, and
     port 2 never the level that the last is of."""
-    early = np.arange(n_times) < n_times // 2
-    ramp = np.linspace(-1.0, 1.0, n_times)
+    early, ramp = np.arange(n_times) < n_times // 2, np.linspace(-1.0, 1.0, n_times)
     return np.stack([0.01 * early, 0.004 * ramp * early, 0.02 * ~early, 0.008 + 0 * ramp, 0 * ramp])
 
 
