@@ -223,11 +223,6 @@ class UnderAnySky:
     model: LinearGaussian
     spectrum: Ells
 
-    @property
-    def data(self) -> Visibilities:
-        """The data."""
-        return self.around.data
-
     @classmethod
     def of(cls, setup: Setup, around: Around, model: LinearGaussian | None = None) -> UnderAnySky:
         """Choose a prior that allows any sky as bright as the data suggest."""
@@ -247,7 +242,7 @@ class UnderAnySky:
         more = max(0, n_ells - len(self.spectrum))
         spectrum = np.pad(self.spectrum, (0, more), mode="edge")[:n_ells]
         model = replace(self.model, coupling=coupling, prior=HarmonicPrior(spectrum))
-        solution = model.condition(np.asarray(self.data.data), FromInformation)
+        solution = model.condition(np.asarray(self.around.data.data), FromInformation)
         return beside_any_sky(solution.chi2, solution.posterior, model.n_data), solution
 
     def under(self, beams: ProductBeams, observation: Observation, pointing: Pointing) -> ChiSquare:
@@ -260,12 +255,12 @@ class UnderAnySky:
         pointing = pointing.placed(observation) if same else Pointing.of(observation, lmax)
         hidden = 0.0 if self.setup.hidden is None else self.setup.hidden
         modes = (np.asarray(beams.modes) + hidden)[..., : n_modes(lmax)]
-        return self.wide(CouplingMatrix.of_modes(modes, pointing, self.data.layout))[0]
+        return self.wide(CouplingMatrix.of_modes(modes, pointing, self.around.data.layout))[0]
 
     def without(self, mistake: DataMistake) -> ChiSquare:
         """Residual chi^2 of the data without a mistake, with N rebuilt for them."""
-        layout = self.data.layout
-        data = replace(self.data, data=np.asarray(layout.gather(mistake.undone(filled(self.data)))))
+        data, layout = self.around.data, self.around.data.layout
+        data = replace(data, data=np.asarray(layout.gather(mistake.undone(filled(data)))))
         try:
             around = replace(self.around, data=data, visibilities=None, gains=None)
             model = full_model(self.setup, around)
@@ -300,7 +295,7 @@ class MixedProducts:
     @classmethod
     def of(cls, judge: UnderAnySky, solution: Solution) -> MixedProducts:
         """Compute Q from data and their solution under the wide prior."""
-        grid, layout, offset = filled(judge.data), judge.data.layout, judge.model.offset
+        grid, layout, offset = filled(data := judge.around.data), data.layout, judge.model.offset
         n, product, time = len(grid), layout.product, layout.time
         mixed = np.zeros((layout.size, n, n))
         mixed[np.arange(layout.size), product] = grid[:, time].T
@@ -315,7 +310,7 @@ class MixedProducts:
         first, second, _ = ports(n_ports)
         autos = first == second
         names = [f"product {product.label}" for product in all_products(n_ports)]
-        some = np.asarray(self.judge.data.layout.present).any(1)
+        some = np.asarray(self.judge.around.data.layout.present).any(1)
 
         def apart(which: Products) -> bool:
             """Whether it changes some, but not all, of the data: a factor of all is the sky's."""
@@ -341,7 +336,8 @@ class MixedProducts:
 
     def explains(self, base: ChiSquare) -> bool:
         """Whether one of these explains most of a large misfit."""
-        return bool(min(chi2 for chi2, _ in self.plain()) < PROMISING * base.chi2)
+        most, (chi2, mistake) = PROMISING * base.chi2, min(self.plain(), key=lambda one: one[0])
+        return bool(chi2 < most and self.judge.without(mistake).chi2 < most)
 
     def chi2(self, w: Columns) -> float:
         """chi^2 of (w, -1)."""
@@ -381,7 +377,7 @@ class MixedProducts:
 
     def _times(self) -> Iterator[tuple[float, DataMistake]]:
         """A factor of all products at one time, for each of the worst times."""
-        data, layout, values = self.judge.data, self.judge.data.layout, self.solution.data
+        layout, values = (data := self.judge.around.data).layout, self.solution.data
         left = self.solution.weighted_residual()  # K^-1 (d - b)
         variance = np.asarray(self.solution.model.noise.diagonal())
         pull = np.bincount(layout.time, values * left, layout.n_times)
@@ -544,7 +540,7 @@ def diagnose(setup: Setup, inference: Inference, residuals: Residuals) -> Diagno
 
 def _tried(judge: UnderAnySky, residuals: Residuals) -> Diagnosis:
     """Try the usual mistakes on data under a model."""
-    setup, data = judge.setup, judge.data
+    setup, data = judge.setup, judge.around.data
     base, solution = judge.wide(judge.model.coupling)
 
     def best(tried: Sequence[tuple[float, object]], most: float) -> list:

@@ -7,7 +7,7 @@ over the sky, and the pieces that programs can request.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from operator import attrgetter
@@ -176,11 +176,13 @@ def _searchable(experiment: Experiment, start: Around, stages: Stages) -> tuple[
     setup, sampled = experiment.setup, experiment.scenario.samples
     if sampled or not (setup.measured and rounds.first_order(setup.scenario)):
         return experiment, start
-    with stages("usual mistakes"):
-        if not is_mistaken(setup, start):
-            return experiment, start
     words = "A mistake explains most of the misfit, and the instrument's unknowns stay as expected."
-    return replace(experiment, doubts=(*experiment.doubts, words)), replace(start, still=True)
+    # numbers that rounding rules are no reason to end
+    with stages("usual mistakes"), suppress(InputError):
+        if is_mistaken(setup, start):
+            experiment = replace(experiment, doubts=(*experiment.doubts, words))
+            return experiment, replace(start, still=True)
+    return experiment, start
 
 
 def _learned(
