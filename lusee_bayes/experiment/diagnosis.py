@@ -498,7 +498,8 @@ class Diagnosis:
             return [f"As a whole, the data fit without assuming a mistake ({self.chi2.words()})."]
         if not self.proposals:
             return [f"None of the {self.n_tried} usual mistakes explains the misfit."]
-        first = "Did you mean" if self.proposals[0].explains else "Explains most of the misfit"
+        first = f"Explains most of chi2 {self.chi2.chi2:.4g} of the instrument as expected"
+        first = "Did you mean" if self.proposals[0].explains else first
         return [f"{first}:"] + [
             f"({number}) {one.words}: {one.remedy} ({one.chi2.words()})."
             for number, one in enumerate(self.proposals, 1)
