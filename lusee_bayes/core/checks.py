@@ -94,8 +94,7 @@ def require_shape(name: str, array: Any, shape: tuple[int | None, ...]) -> None:
     """
     got = tuple(array.shape)
     if len(got) != len(shape) or any(s not in (None, g) for s, g in zip(shape, got, strict=True)):
-        expected = str(shape).replace("None", "any")
-        raise InputError(f"{name} has shape {got}, expected {expected}")
+        raise InputError(f"{name} has shape {got}, expected {str(shape).replace('None', 'any')}")
 
 
 def _first_offenders(bad: np.ndarray) -> str:

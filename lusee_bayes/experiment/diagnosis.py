@@ -431,7 +431,8 @@ SAME = 1e-5
 BEYOND, MORE_ELLS = "the sky has structure beyond lmax", 8
 # offsets to solve for, and decreasing steps in degrees to either side
 OFFSETS, REACHES = ("turntable_deg", "tilt_east_deg", "tilt_north_deg"), (4.0, 0.5)
-# limit on the sum of products of neighbouring times, in standard deviations for white noise
+# limit on the sum of products of neighbouring times, in standard deviations for white noise; what
+# sky and instrument absorb leaves a negative one
 WHITE = 5.0
 
 
@@ -633,15 +634,15 @@ def _offsets(judge: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMi
 
 
 def _noise_level(residuals: Residuals, data: Visibilities) -> Iterator[Proposal]:
-    """Another noise level, if residuals are white: equal in all groups, uncorrelated in time."""
+    """Another noise level, if residuals are alike in all groups, and do not persist in time."""
     whole, groups = residuals.split.instrument, [g for g in residuals.compared() if g.degrees > 1.0]
     factor = whole.chi2 / whole.degrees
-    if not groups or not factor > 0.0:
+    if not groups or whole.fits or not factor > 0.0:
         return
     least = min(ChiSquare(group.chi2 / factor, group.degrees).p for group in groups)
     z = np.where(data.layout.present, data.layout.scatter(residuals.z), np.nan) / np.sqrt(factor)
     pairs = (z[:, 1:] * z[:, :-1])[np.isfinite(z[:, 1:] * z[:, :-1])]
-    if stands_out(least, len(groups)) or abs(pairs.sum()) > WHITE * np.sqrt(len(pairs)):
+    if stands_out(least, len(groups)) or pairs.sum() > WHITE * np.sqrt(len(pairs)):
         return
     yield Proposal(
         f"the noise variance is {factor:.3g} times the assumed one",

@@ -136,6 +136,11 @@ class Inference:
         """Posterior of a systematic's unknowns from these data, in prior standard deviations."""
         return template_amplitudes(self.solution, part.columns)
 
+    def unused(self) -> float:
+        """Degrees of freedom that errors of learned size leave unused if there are no errors."""
+        learning = (part for part in self.moving if part.systematic.learns)
+        return sum(float(np.sum(1.0 - self.amplitudes(part).std ** 2)) for part in learning)
+
     def misfit(self) -> float:
         """Chi^2 per datum of the sky and the values at the expansion point, under the rest of N."""
         factor, solution, noise = self.solution.factor, self.solution, self.model.noise
@@ -451,8 +456,7 @@ def _beginning(setup: Setup, around: Around) -> Around:
     """
     if not first_order(setup.scenario):
         return around
-    exact = _exact(setup, around)
-    rounds = MAX_TEMPERED_ROUNDS * around.still
+    exact, rounds = _exact(setup, around), MAX_TEMPERED_ROUNDS * around.still
     return replace(exact.around, tempered=_tempered(exact.misfit(), rounds))
 
 

@@ -294,8 +294,7 @@ def turned_by_offsets(pointing: Pointing, hours: Array, values: Values) -> Point
     given = {name: xp.asarray(value, dtype=np.float64) for name, value in values.items()}
     zero = xp.zeros(())
     late_h = given.get("clock_s", zero) / 3600.0
-    drift = given.get("clock_drift_s_per_day", zero) / 86400.0
-    radians = np.pi / 180.0
+    drift, radians = given.get("clock_drift_s_per_day", zero) / 86400.0, np.pi / 180.0
     # a lander further East sees the sky as it will be later
     lon = given.get("lon_deg", zero) * radians - TURN_PER_HOUR * late_h
     angles = [given.get(name, zero) * radians for name in ("lat_deg", *TILTS)]

@@ -92,6 +92,10 @@ class ChiSquare:
             return "fainter, or closer to the prior's mean, than the prior assumes"
         return "inconsistent with the prior"
 
+    def allowing(self, unused: float) -> ChiSquare:
+        """The same if unknowns, of less than their prior's size, leave up to so many unused."""
+        return ChiSquare(self.chi2, min(self.degrees, max(self.chi2, self.degrees - unused)))
+
     def words(self) -> str:
         """p, and chi^2 with its expectation."""
         return f"p {probability(self.p)}, {self.chi2_words()}"

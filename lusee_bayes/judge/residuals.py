@@ -178,7 +178,7 @@ class Residuals:
         return parts
 
 
-def residuals(solution: Solution, data: Visibilities) -> Residuals:
+def residuals(solution: Solution, data: Visibilities, unused: float = 0.0) -> Residuals:
     """Compare data with the model's predictions for them, group by group.
 
     Days have 24 hours from the first sample. Runs at the same turntable angle are one group.
@@ -189,6 +189,8 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
         Of these data.
     data : Visibilities
         In K, with their times and turntable angles.
+    unused : float
+        Degrees of freedom that unknowns may leave unused (:meth:`.ChiSquare.allowing`).
 
     Returns
     -------
@@ -202,6 +204,7 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
     """
     model, layout = solution.model, data.layout
     split = Split.of(solution.posterior, solution.chi2, model.n_data, solution.matrix)
+    split = replace(split, instrument=split.instrument.allowing(unused))
     left_out = LeftOut.of(replace(model, prior=split.wide.prior), data, split.wide)
     if left_out is None:
         return Residuals(np.full(model.n_data, np.nan), split, ())
@@ -211,6 +214,7 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
         n, own, others_p = missed.n, whole, np.nan
         if n < model.n_data:
             own = ChiSquare(missed.chi2, n - with_sky(n - missed.degrees))
+            own = own.allowing(unused * own.degrees / whole.degrees)
             # NaN if own is larger, which rounding causes
             others_p = ChiSquare(whole.chi2 - own.chi2, whole.degrees - own.degrees).p
         return Group(group.kind, group.name, n, own.degrees, own.chi2, own.p, others_p)

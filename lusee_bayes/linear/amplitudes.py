@@ -272,10 +272,9 @@ class Shared:
         at = np.linalg.lstsq(self.root, self.mean, rcond=None)[0]
         weight, pulled = self.root.T @ inverse, self.pull.T @ inverse
         across, among = weight @ self.pull, (weight - self.root.T) @ self.root
-        matrix = np.block([[local.matrix + pulled @ self.pull, across.T], [across, among]])
         return replace(
             local,
-            matrix=matrix,
+            matrix=np.block([[local.matrix + pulled @ self.pull, across.T], [across, among]]),
             vector=np.concatenate([local.vector, self.root.T @ self.mean]),
             reference=np.concatenate([sky, at]),
             misfit=np.asarray(local.misfit - self.mean @ self.mean),

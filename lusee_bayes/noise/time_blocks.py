@@ -287,8 +287,7 @@ def _block_rows(band: Array) -> tuple[Array, Array]:
     """Rearrange the band into block rows: (blocks, rows, window) before the diagonal, and on it."""
     n_times, widths, products, _ = band.shape
     steps = max(1, ROWS // products)
-    before = max(1, -(-(widths - 1) // steps))  # block columns that the band reaches back
-    n = -(-n_times // steps)
+    before, n = max(1, -(-(widths - 1) // steps)), -(-n_times // steps)
     padded = jnp.pad(band, ((0, n * steps - n_times), (0, 0), (0, 0), (0, 0)))
     padding = jnp.asarray(np.arange(n * steps) >= n_times, dtype=band.dtype)
     padded = padded.at[:, 0].add(padding[:, None, None] * jnp.eye(products)[None])

@@ -156,8 +156,7 @@ def scenario_maps(cases: Cases) -> Figure:
         axes.set_title(title, fontsize=11)
     bar = {"location": "bottom", "aspect": 60, "shrink": 0.7, "pad": 0.04}
     drawing.colour_bar(figure, image, figure.axes, label="K", extend="both", **bar)
-    how = _how_drawn(cases["fiducial"])
-    figure.suptitle(f"Maps at 25 MHz, Galactic coordinates; {how}")
+    figure.suptitle(f"Maps at 25 MHz, Galactic coordinates; {_how_drawn(cases['fiducial'])}")
     return figure
 
 

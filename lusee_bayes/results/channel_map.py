@@ -254,7 +254,7 @@ class Conditioned:
         experiment, inference, stages = self.experiment, self.from_data, stages or Stages()
         scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
         fluxes, pointing, diagnosis, left, judged = None, None, None, None, None
-        judge = self.judged.solution
+        judge, unused = self.judged.solution, inference.unused()
         if experiment.setup.responses and scenario.sources.treatment != "ignored":
             with stages("fluxes"):
                 fluxes = flux_table(experiment, inference)
@@ -262,8 +262,9 @@ class Conditioned:
             if not (alone or thorough):
                 given = judge.posterior, judge.chi2, inference.model.n_data, judge.matrix
                 instrument = Split.of(*given, None if joint else self.expected).instrument
+                instrument = instrument.allowing(unused)
             if alone or thorough or instrument.p < DOUBTFUL:
-                left = residuals(judge, data)
+                left = residuals(judge, data, unused)
                 instrument = left.split.instrument
             details = _details(self) if alone else None
         bad = left is not None and left.level() == "does not fit"

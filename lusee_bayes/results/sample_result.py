@@ -165,8 +165,7 @@ class ValidationResult:
 
     def headline(self) -> str:
         """The verdict, in one line."""
-        checks = self.checks
-        verdict = "passed" if self.passed else "FAILED"
+        checks, verdict = self.checks, "passed" if self.passed else "FAILED"
         return f"{verdict}: {sum(c.passed for c in checks)} of {len(checks)} checks pass"
 
     def summary(self) -> ValidationSummary:

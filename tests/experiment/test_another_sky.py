@@ -306,9 +306,30 @@ def test_unknown_antennas_do_not_absorb_a_mistake(name):
         expected = set_up(scenario, data).above.power
         np.testing.assert_array_equal(experiment.setup.above.power, expected)
     left = residuals((found := lb.infer(experiment)).solution, data)
+    dense = found.model.coupling.dense() @ found.model.prior.colour_columns(np.eye(49))
+    covariance = dense @ dense.T + found.model.noise.dense()
+    fields = [part.columns for part in found.moving if part.systematic.learns]
+    unused = sum(np.trace(u.T @ np.linalg.solve(covariance, u)) for u in fields)
+    assert found.unused() == pytest.approx(unused, rel=1e-4)
     assert left.level() == "does not fit"
     named = diagnosis.diagnose(experiment.setup, found, left)
     assert is_named(wrong, named) and named.sentences()[0].startswith("Explains most of chi2")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        pytest.param(NOTHING, marks=pytest.mark.essential),
+        *(pytest.param(w, marks=pytest.mark.long) for w in wrong_data.WRONG if "noise" in w.name),
+    ],
+)
+def test_fields_as_expected_do_not_look_like_less_noise(wrong, tmp_path):
+    """Without errors of the fields, many of the data scatter less than the model expects."""
+    data, scenario = of_other_antennas(wrong)
+    (found,) = lb.run_map(scenario, tmp_path / "run", data=data).result.channels
+    named = found.diagnosis is not None and is_named(wrong, found.diagnosis)
+    assert found.judged.level == ("consistent" if wrong is NOTHING else "does not fit")
+    assert named == (wrong is not NOTHING)
 
 
 @pytest.mark.long

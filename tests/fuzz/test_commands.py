@@ -106,8 +106,7 @@ def test_wrong_input_is_a_sentence(line, message, folder, capsys):
     words = line.split(" ")
     if words[1:2] == ["fiducial"]:
         words[2:2] = SMALL
-    before = sorted(p.name for p in folder.rglob("*"))
-    said = refused(capsys, *words)
+    before, said = sorted(p.name for p in folder.rglob("*")), refused(capsys, *words)
     assert re.search(message, said) and "Section" not in said, said
     assert sorted(p.name for p in folder.rglob("*")) == before
 

@@ -92,8 +92,7 @@ def test_short_dipoles_have_their_closed_form(kind):
     made = sampled_beams(FREQUENCY, **KINDS[kind](Dipoles()), absolute=True)
     grid = HemisphereGrid.gauss_legendre(12, 20)
     n = unit_vectors(grid)
-    along = np.tensordot(arms, n, 1)
-    phase = np.exp(1j * k * np.tensordot(places, n, 1))
+    along, phase = np.tensordot(arms, n, 1), np.exp(1j * k * np.tensordot(places, n, 1))
     expected = (arms @ arms.T)[:, :, None, None] - along[:, None] * along[None]
     expected = expected * phase[:, None] * phase[None].conj() / 2
     # baselines of 4 m have l = k b + 2 = 4 at most

@@ -151,8 +151,7 @@ def around(n0, g, reach, n_radius, n_angle):
     x, w = np.polynomial.legendre.leggauss(n_radius)
     height = 1 - np.cos(reach)  # Gauss nodes in sqrt(1 - cos gamma), about the radius
     root = (x + 1) / 2 * np.sqrt(height)
-    cosine = 1 - root**2
-    ring = w / 2 * np.sqrt(height) * 2 * root * 2 * np.pi / n_angle
+    cosine, ring = 1 - root**2, w / 2 * np.sqrt(height) * 2 * root * 2 * np.pi / n_angle
     terms = ((2 * ell + 1) * g[ell] * eval_legendre(ell, cosine) for ell in range(len(g)))
     kernel, across = sum(terms) / (4 * np.pi), np.cross(n0, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)

@@ -189,8 +189,7 @@ def test_real_experiment_to_sixty_digits(instrument, form):
 
 def graded(n_data: int, largest: float, lmax=5, seed=1):
     """A model in which singular values of W run from 1 to ``largest``, and data of it."""
-    rng = np.random.default_rng(seed)
-    spectrum = 10.0 * np.arange(1.0, lmax + 2.0) ** -2
+    rng, spectrum = np.random.default_rng(seed), 10.0 * np.arange(1.0, lmax + 2.0) ** -2
     prior = per_mode(spectrum)
     rank = min(n_data, len(prior))
     left = np.linalg.qr(rng.normal(size=(n_data, rank)))[0]

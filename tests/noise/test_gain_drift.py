@@ -96,8 +96,7 @@ def test_mean_and_covariance_of_simulated_histories():
     response = np.array([1.0 + sigma**2 * (i == j) for i, j in pairs(n_antennas)])
     np.testing.assert_allclose(drift.mean_response(n_antennas**2), response, rtol=1e-15)
     keep = ~flags.ravel()
-    mean = (d * response[:, None]).ravel()[keep]
-    scale = np.abs(d).ravel()[keep] * sigma
+    mean, scale = (d * response[:, None]).ravel()[keep], np.abs(d).ravel()[keep] * sigma
     many = jax.jit(jax.vmap(with_gains, (None, 0)))
     first, second, fourth = 0.0, 0.0, 0.0
     for _ in range(n // chunk):

@@ -177,8 +177,7 @@ def test_an_absent_auto_is_interpolated_in_time():
 def test_every_sample_has_its_own_live_time(form):
     """The mean of samples, weighted by live time, has the noise of all of their live time."""
     live = np.random.default_rng(4).uniform(10.0, 300.0, 5)
-    v = jnp.repeat(VISIBILITIES[:, :1], 5, axis=1)
-    layout = DataLayout(N_PRODUCTS, 5)
+    v, layout = jnp.repeat(VISIBILITIES[:, :1], 5, axis=1), DataLayout(N_PRODUCTS, 5)
     fine = np.asarray(lb.radiometer_noise(v, layout, step_s=live, form=form).dense())
     weight = np.kron(np.eye(16), live / live.sum())
     expected = weight @ fine @ weight.T
@@ -199,8 +198,7 @@ def test_their_covariance_is_that_of_the_exact_form():
     a = rng.normal(size=(4, 5)) + 1j * rng.normal(size=(4, 5))
     one = a @ a.conj().T
     t = np.broadcast_to(one[..., None], (4, 4, DRAWS)).copy()
-    drawn = to_real(sample_covariances(t, AVERAGED, rng))
-    true = to_real(one[..., None])
+    drawn, true = to_real(sample_covariances(t, AVERAGED, rng)), to_real(one[..., None])
     block, found = np.asarray(exact_blocks(true))[0] / AVERAGED, np.cov(drawn)
     # a sample covariance of Gaussians scatters by this
     std = np.sqrt((block**2 + np.outer(block.diagonal(), block.diagonal())) / DRAWS)

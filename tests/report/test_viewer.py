@@ -111,8 +111,7 @@ def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_p
     page = (run.folder / "report.html").read_text()
     kernels = np.array(run_page(page, tmp_path, commands)["kernels"])
     lon, lat = np.radians(POINTS).T
-    y = synthesis_matrix(np.pi / 2 - lat, lon, 8)
-    there = pixel_matrix(KERNEL_NSIDE, 8)
+    y, there = synthesis_matrix(np.pi / 2 - lat, lon, 8), pixel_matrix(KERNEL_NSIDE, 8)
     posterior = lb.infer(lb.build(run.result.scenario)).posterior
     expected = np.asarray(resolution_rows(posterior, y)) @ there.T
     (channel,) = read_channels(run.folder / "diagnostics.nc")

@@ -173,8 +173,7 @@ def test_simulated_receivers_have_the_covariance(response_file):
             powers = np.array([truth[f"receiver_{port}_k"] for port in range(N_PORTS)])
             values[seed, k] = (powers / mean - 1.0) / 0.5
     flat = values.reshape(n_seeds, -1)
-    found = flat.T @ flat / n_seeds
-    wanted = np.kron(ties(FREQUENCIES), np.eye(N_PORTS))
+    found, wanted = flat.T @ flat / n_seeds, np.kron(ties(FREQUENCIES), np.eye(N_PORTS))
     assert np.abs(found - wanted).max() < 4.5 * np.sqrt(2 / n_seeds)
     assert np.abs(flat.mean(0)).max() < 4.0 / np.sqrt(n_seeds)
     # a smooth function: between 20 and 22 MHz, 0.1375 octaves apart, a third of what it varies by

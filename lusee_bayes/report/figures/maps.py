@@ -89,9 +89,8 @@ def sky_maps(result: MapResult) -> Panels:
 
 
 def _figures(panels: Mapping[str, tuple], channel: ChannelResult) -> Panels:
-    altitude = channel.highest_altitude
     return {
-        title: drawing.sky_figure(title, *panel, altitude=altitude)
+        title: drawing.sky_figure(title, *panel, altitude=channel.highest_altitude)
         for title, panel in panels.items()
     }
 
