@@ -233,9 +233,8 @@ def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) 
     if not data.says_window:
         if timestamp is None:
             raise InputError(
-                f"{path} does not specify the meaning of its times: it has neither time_bounds nor "
-                "the attribute window = 'instant'; use --set observation.timestamp=start (or "
-                "middle, end, instant)"
+                f"{path} says nothing about windows: neither time_bounds nor window = 'instant'; "
+                "use --set observation.timestamp=start (or middle, end, instant)"
             )
         with naming(path):
             return data.stamped(timestamp)
@@ -332,9 +331,8 @@ def recipe_of(scenario: Scenario) -> Recipe:
     """
     if (section := scenario.flight) is None:
         raise InputError(
-            "the data are sessions of the spectrometer, but the scenario has no section flight to "
-            "reduce them; add one, or --set 'flight={gain_table: ..., bin_origin: centre}' "
-            "(docs/howto/first_light.md)"
+            "the data are sessions of the spectrometer, but the scenario has no section flight; "
+            "add one, or --set 'flight={gain_table: ...}' (docs/howto/first_light.md)"
         )
     if section.gain_table is None:
         raise InputError(

@@ -423,8 +423,9 @@ TRIED, PROMISING = 3, 0.1
 EXPLAINED = 0.03
 # a smaller chi^2 per degree of freedom means that without the mistake N would be far too large
 LEAST = 0.5
-# any mistake must reduce the excess by more than this number of standard deviations
-SIGNIFICANT = 10.0
+# any mistake must reduce chi^2, or its excess, by more than this number of standard deviations, and
+# is listed if it reduces it by more than this fraction of the best one's
+SIGNIFICANT, COMPARABLE = 15.0, 0.5
 # mistakes are indistinguishable for these antennas if their chi^2 differ by less, relative
 SAME = 1e-5
 # ells to add to lmax
@@ -446,22 +447,27 @@ class Proposal:
         The mistake, and the remedy.
     chi2 : ChiSquare
         Residual chi^2 of the data without the mistake.
+    of_noise : bool
+        Whether N is the mistake.
     """
 
     words: str
     remedy: str
     chi2: ChiSquare
+    of_noise: bool = False
 
-    @property
-    def excess(self) -> float:
-        """Distance of chi^2 from its expected value."""
-        return abs(self.chi2.chi2 - self.chi2.degrees)
+    def gained(self, before: ChiSquare) -> float:
+        """By how much chi^2 is smaller without the mistake or, with another N, closer to its mean.
+
+        In standard deviations.
+        """
+        free, now = max(before.degrees - self.chi2.degrees, 1.0), self.chi2.chi2
+        closer = abs(before.chi2 - before.degrees) - abs(now - self.chi2.degrees)
+        return (closer if self.of_noise else before.chi2 - now) / (2.0 * free) ** 0.5
 
     def suffices(self, before: ChiSquare) -> bool:
-        """Whether chi^2 fits without the mistake, and is much closer to its expected value."""
-        free = max(before.degrees - self.chi2.degrees, 1.0)
-        gained = abs(before.chi2 - before.degrees) - self.excess
-        return self.explains and gained > SIGNIFICANT * (2.0 * free) ** 0.5
+        """Whether chi^2 fits without the mistake, and much better than before."""
+        return self.explains and self.gained(before) > SIGNIFICANT
 
     @property
     def explains(self) -> bool:
@@ -537,11 +543,12 @@ def diagnose(setup: Setup, inference: Inference, residuals: Residuals) -> Diagno
         judge = UnderAnySky.of(as_expected(setup), Around(inference.around.data))
         if (found := _tried(judge, residuals)).proposals:
             return found
-    return _tried(UnderAnySky.of(setup, inference.around, inference.model), residuals)
+    judge = UnderAnySky.of(setup, inference.around, inference.model)
+    return _tried(judge, residuals, inference.unused())
 
 
-def _tried(judge: UnderAnySky, residuals: Residuals) -> Diagnosis:
-    """Try the usual mistakes on data under a model."""
+def _tried(judge: UnderAnySky, residuals: Residuals, unused: float = 0.0) -> Diagnosis:
+    """Try the usual mistakes on data under a model whose unknowns leave some degrees unused."""
     setup, data = judge.setup, judge.around.data
     base, solution = judge.wide(judge.model.coupling)
 
@@ -554,17 +561,19 @@ def _tried(judge: UnderAnySky, residuals: Residuals) -> Diagnosis:
     promising = base.degrees + PROMISING * abs(base.chi2 - base.degrees)
     proposals = [Proposal(m.words, m.remedy, judge.without(m)) for m in best(of_data, promising)]
     low = Pointing.of(setup.observation, min(SCREENED_LMAX, setup.scenario.lmax))
-    mistakes = list(model_mistakes(setup))
+    # with the instrument that was found
+    placed = moved(setup, judge.around.values)
+    mistakes = list(model_mistakes(placed))
     screened = [judge.under(m.beams, m.observation, low).chi2 for m in mistakes]
     # at low lmax, sky structure above it remains in the residuals
-    whole = judge.under(setup.beams, setup.observation, low).chi2
-    of_model = [*zip(screened, mistakes, strict=True), *_offsets(judge, low)]
+    whole = judge.under(placed.beams, placed.observation, low).chi2
+    of_model = [*zip(screened, mistakes, strict=True), *_offsets(judge, placed, low)]
     proposals += [
         Proposal(m.words, m.remedy, judge.under(m.beams, m.observation, setup.pointing))
         for m in best(of_model, whole)
     ]
     excess = (PROMISING if mixed.explains(base) else EXPLAINED) * abs(base.chi2 - base.degrees)
-    nearly = [one for one in proposals if one.excess < excess and not one.chi2.too_small]
+    nearly = [p for p in proposals if 0.0 <= p.chi2.chi2 - p.chi2.degrees < excess]
     others = list(_noise_of(judge, "exact"))
     suffice = [one for one in (*proposals, *others) if one.suffices(base)]
     # these always absorb part of any misfit, and count only if they absorb all of it
@@ -572,8 +581,15 @@ def _tried(judge: UnderAnySky, residuals: Residuals) -> Diagnosis:
         if not suffice:
             others += (last := list(absorbing))
             suffice = [one for one in last if one.suffices(base)]
-    listed = sorted(suffice or ([] if base.fits else nearly), key=lambda one: one.excess)
-    return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + len(others))
+    listed = sorted(suffice or ([] if base.fits else nearly), key=lambda one: one.chi2.chi2)
+    most = max((one.gained(base) for one in listed), default=0.0)
+    listed = [
+        replace(one, chi2=one.chi2.allowing(unused))
+        for one in listed
+        if one.gained(base) > COMPARABLE * most
+    ]
+    n_tried = len(of_data) + len(of_model) + len(others)
+    return Diagnosis(base.allowing(unused), tuple(_merged(listed)), n_tried)
 
 
 def _noise_of(judge: UnderAnySky, form: str) -> Iterator[Proposal]:
@@ -585,7 +601,7 @@ def _noise_of(judge: UnderAnySky, form: str) -> Iterator[Proposal]:
         chi2 = replace(judge, model=model).wide(model.coupling)[0]
         how = {"exact": "correlated", "paper": "independent, as in some simulations"}[form]
         words = f"the noise of the products is {how}"
-        yield Proposal(words, f"use --set noise.radiometer.form={form}", chi2)
+        yield Proposal(words, f"use --set noise.radiometer.form={form}", chi2, True)
 
 
 def _merged(proposals: list[Proposal]) -> Iterator[Proposal]:
@@ -610,9 +626,10 @@ def _finer(judge: UnderAnySky) -> Iterator[Proposal]:
     yield Proposal(BEYOND, f"use --set lmax={lmax}", chi2)
 
 
-def _offsets(judge: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMistake]]:
+def _offsets(
+    judge: UnderAnySky, setup: Setup, low: Pointing
+) -> Iterator[tuple[float, ModelMistake]]:
     """Best-fitting offsets of angles, from parabolas through three ever closer values."""
-    setup = judge.setup
     for name in offset_names(OFFSETS, setup.observation.n_runs):
 
         def shifted(value: float, name: str = name) -> Observation:
@@ -648,4 +665,5 @@ def _noise_level(residuals: Residuals, data: Visibilities) -> Iterator[Proposal]
         f"the noise variance is {factor:.3g} times the assumed one",
         f"multiply noise.radiometer.factor by {factor:.3g}",
         ChiSquare(whole.degrees, whole.degrees),
+        of_noise=True,
     )

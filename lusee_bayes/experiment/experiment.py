@@ -37,7 +37,6 @@ from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
 from lusee_bayes.systematics.beam import BeamErrors
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities
-from lusee_bayes.systematics.field_errors import STD
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.sources import PointSources
@@ -341,8 +340,6 @@ def posterior_draws(
 
 # rms error of interpolated beams in the data, over radiometer noise, above which to warn
 MOST_OFF = 0.1
-# learned field errors that are larger than expected by this factor are reported
-LARGE = 10.0
 
 
 def interpolation_error(setup: Setup) -> dict[str, float]:
@@ -373,11 +370,11 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
             f"omitting the files of {worst}; use more files, in smaller steps."
         )
     setup = experiment.setup
-    std, stated = (inference.around.values or {}).get(STD, 0.0), setup.scenario.noise.fields
-    if stated is not None and std > LARGE * stated.std:
+    if (size := inference.size_of_fields) > rounds.LARGE:
+        percent = 100.0 * size * setup.scenario.noise.fields.std
         notes.append(
-            f"The data require field errors of {100.0 * std:.2g} %, {std / stated.std:.0f} times "
-            "noise.fields.std. Mistakes look alike: beam.exact=true tests the usual ones."
+            f"The data require field errors of {percent:.2g} %, {size:.2g} times noise.fields.std. "
+            "Mistakes look alike: the usual ones were tried."
         )
     if setup.scenario.noise.radiometer.form == "exact":
         seen = noise_visibilities(setup, inference.around, radiometer_about(setup))
@@ -385,15 +382,13 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
             notes.append(
                 f"At {(~known).sum()} of {counted(len(known), 'time')} no voltages of independent "
                 "ports have these visibilities; the noise of the products is taken as independent. "
-                "Products may be exchanged or wrong, or ports depend on each other, as those of "
-                "ideal dipoles do."
+                "Products may be exchanged or wrong, or ports depend on each other (ideal dipoles)."
             )
     if learned is not None and not learned.settled:
         notes.append("The prior is fixed and wide: its parameters do not converge for any noise.")
     elif learned is not None and learned.noise_factor > 1.0:
         notes.append(
-            f"The prior was learned with N times {learned.noise_factor:.2g}, to match residual "
-            "chi2; the map uses the scenario's N."
+            f"The prior, but not the map, uses N times {learned.noise_factor:.2g}, to match chi2."
         )
     for name, gain in () if learned is None else learned.survey_gains:
         if gain < 0.0:

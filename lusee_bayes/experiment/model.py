@@ -348,8 +348,7 @@ def true_values(setup: Setup) -> Truth:
 
 def true_model(setup: Setup, truth: Truth) -> LinearGaussian:
     """The model of simulated data: true instrument, true values and radiometer noise."""
-    key = jax.random.key(setup.scenario.seed)
-    true = moved(setup, truth, above=True)
+    key, true = jax.random.key(setup.scenario.seed), moved(setup, truth, above=True)
     model = LinearGaussian(true.coupling, setup.prior, radiometer(setup), true.offset)
     for cls, section in present(setup.scenario):
         model = cls.in_data(section, true, model, truth, key)

@@ -67,6 +67,8 @@ NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
 # number of noise draws, always the same, that estimate the volume of skies that fit, the standard
 # errors that the slope must exceed, and the largest modes x unknowns for the exact one
 VOLUME_DRAWS, VOLUME_DOUBT, EXACT_VOLUME = 8, 3.0, 1500
+# if field errors are larger than expected by this factor, this is said, and mistakes are tried
+LARGE = 3.0
 # relative rms by which the visibilities may be off around which drifts of the gains are inferred
 SAME_VISIBILITIES = 0.1
 # steps that oscillate are halved, down to this fraction of the full step
@@ -136,10 +138,15 @@ class Inference:
         """Posterior of a systematic's unknowns from these data, in prior standard deviations."""
         return template_amplitudes(self.solution, part.columns)
 
+    @property
+    def size_of_fields(self) -> float:
+        """Learned size of the fields' errors, over the expected one; 0 if it is not learned."""
+        return max((s.systematic.size for s in self.moving if s.systematic.learns), default=0.0)
+
     def unused(self) -> float:
         """Degrees of freedom that errors of learned size leave unused if there are no errors."""
         learning = (part for part in self.moving if part.systematic.learns)
-        return sum(float(np.sum(1.0 - self.amplitudes(part).std ** 2)) for part in learning)
+        return float(sum(np.sum(1.0 - self.amplitudes(part).std ** 2) for part in learning))
 
     def misfit(self) -> float:
         """Chi^2 per datum of the sky and the values at the expansion point, under the rest of N."""

@@ -568,8 +568,7 @@ def _preferred(experiment: Experiment, result: Inference, values: dict[str, floa
     centre = dict.fromkeys(steps, 0.0) | values
     offsets = PointingOffsets.of(shifted(setup, centre), steps, centre)
     expanded = Expanded.at(offsets, base_model(setup), Around(sky=sky, values=centre))
-    per_unit = np.asarray(expanded.columns) / offsets.stds
-    day = setup.observation.day
+    per_unit, day = np.asarray(expanded.columns) / offsets.stds, setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)
     stretches = [(-1, -1, np.ones(len(day), dtype=bool))]
     for first in (np.unique(day // length) * length).tolist():

@@ -167,8 +167,7 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     return (
         f"Residual chi2 would not reveal an error of {named}, which the model takes as exact. In "
         "brackets: by how many standard deviations it would shift the map (rms over independent "
-        "directions). To allow for such errors, add noise.beam.parameters or noise.fields; more "
-        "turntable angles reveal more of them."
+        "directions). Add noise.beam.parameters or noise.fields, or more turntable angles."
     )
 
 
@@ -210,8 +209,7 @@ def blind_spots(
         has.add(FIELDS_NAME)
     moved_setup = moved(setup, inference.around.values)
     solution, model = inference.solution, base_model(moved_setup, inference.around)
-    root = solution.posterior.root()
-    wide = inference.under_any_sky().posterior.root()
+    root, wide = solution.posterior.root(), inference.under_any_sky().posterior.root()
     spots, degrees = [], max(inference.model.n_data - len(sky), 1)
     for systematic, sizes, unit in errors_of(moved_setup, pointing=pointing):
         if has.issuperset(sizes):
@@ -240,9 +238,8 @@ def about_sky_above(setup: Setup) -> list[str]:
     enough = lmax + int(np.argmax(above_ell < np.sqrt(2.0 * n_data)))
     return [
         f"The sky above lmax = {lmax} adds about {added:.2g} standard deviations of the noise to "
-        "every datum (rms). It is marginalised, which makes error bars larger. Above lmax = "
-        f"{enough} it would add less to chi2 than chance. Simulations may end at lmax: then use "
-        "noise.above_lmax.treatment=ignored."
+        f"every datum (rms), and makes error bars larger. Above lmax = {enough} it would add less "
+        "than chance. Simulations may end at lmax: then use noise.above_lmax.treatment=ignored."
     ]
 
 

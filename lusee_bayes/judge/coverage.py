@@ -97,8 +97,7 @@ class Counts:
         deviations : (draws, modes) array
             Draws of the posterior minus its mean, in K.
         """
-        nside = healpy.npix2nside(len(std))
-        skies = np.stack([error, *deviations])
+        nside, skies = healpy.npix2nside(len(std)), np.stack([error, *deviations])
         blocks = np.array_split(skies, -(-len(skies) // AT_ONCE))
         return cls.of(latitudes(nside), (modes_to_map(some, nside) / std for some in blocks))
 

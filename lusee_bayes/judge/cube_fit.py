@@ -230,8 +230,7 @@ def shared_tests(
         Of the channels.
     """
     inverse, blocks = np.linalg.inv(covariance), root_of_kernels(kernels)
-    pull = np.einsum("kij,kj->ki", inverse, mean)
-    precision = inverse - np.eye(len(names))
+    pull, precision = np.einsum("kij,kj->ki", inverse, mean), inverse - np.eye(len(names))
     seen = np.swapaxes(blocks, 1, 2) @ precision @ blocks
     pulled = np.einsum("kiw,ki->kw", blocks, pull)
     agree, tests = list(range(len(mean))), [(0.0, 0)] * len(mean)

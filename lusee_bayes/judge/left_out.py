@@ -280,8 +280,7 @@ class LeftOut:
         if n == np.count_nonzero(self.present):
             return Missed(n, np.nan, np.nan)
         blocks, places = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
-        where = np.ix_(blocks, places)
-        root = roots(self._weights[blocks], cells[blocks])
+        where, root = np.ix_(blocks, places), roots(self._weights[blocks], cells[blocks])
         b = solve_roots(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
         # all NaN if Q_s, or 1 - W W^T, has no root

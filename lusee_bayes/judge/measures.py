@@ -238,8 +238,7 @@ def highest_altitude(observation: Observation, nside: int) -> Pixels:
         above the horizon: there the map comes from the prior alone.
     """
     directions = np.array(healpy.pix2vec(nside, np.arange(healpy.nside2npix(nside))))
-    zeniths = observation.zenith_galactic()
-    highest = np.full(directions.shape[1], -1.0)
+    zeniths, highest = observation.zenith_galactic(), np.full(directions.shape[1], -1.0)
     for chunk in np.array_split(zeniths, max(1, len(zeniths) // 256)):
         np.maximum(highest, (chunk @ directions).max(axis=0), out=highest)
     return highest

@@ -48,8 +48,7 @@ def require_plausible(data: Visibilities, signal: Grid, std: DataVector) -> tupl
     """
     values, layout = np.asarray(data.grid()), data.layout
     sigma = np.asarray(layout.scatter(np.asarray(std)))
-    modelled = np.asarray(signal)
-    autos = auto_indices(round(np.sqrt(layout.n_products)))
+    modelled, autos = np.asarray(signal), auto_indices(round(np.sqrt(layout.n_products)))
     typical = float(np.median(modelled[autos]))
     _refuse(
         data,

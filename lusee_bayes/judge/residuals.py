@@ -148,6 +148,8 @@ class Residuals:
         off = self.extremes()
         small = self.split.instrument.too_small and all(one.chi2 < one.degrees for one in off)
         why = "The noise is smaller than assumed" if small else "No sky explains these data"
+        if not stands_out(self.split.instrument.p, self.n_tests):
+            why = "As a whole, the data fit"
         blame = [] if small else self._blame(truncated)
         return Fit(level, " ".join([f"{why} ({instrument}).", *blame]))
 

@@ -224,9 +224,8 @@ class Information(Described, eqx.Module):
         accepted = CONVERGENCE * max(1.0, float(np.sqrt(np.mean(np.square(u)))))
         if not moved <= accepted:
             raise InputError(
-                f"the posterior mean did not converge: its last step was {moved:.2g} standard "
-                f"deviations (accepted: {accepted:.2g}); the data are too precise for the normal "
-                "equations, or far outside the prior"
+                f"the posterior mean did not converge: last step {moved:.2g} standard deviations "
+                f"(accepted: {accepted:.2g}); data are too precise, or far outside the prior"
             )
         return Posterior(prior, u, lower, None, np.asarray(log_evidence), np.asarray(moved))
 

@@ -264,8 +264,7 @@ def _suppression(cases: Cases) -> Verdict:
 
 def _noise_x10(cases: Cases) -> Verdict:
     case = cases["noise_x10"]
-    low = first_below(case["rho"].values, 0.9)
-    drop = cross(cases["fiducial"]) - cross(case)
+    low, drop = first_below(case["rho"].values, 0.9), cross(cases["fiducial"]) - cross(case)
     fine = power_ratio(case, 25, 47) / power_ratio(cases["fiducial"], 25, 47)
     text = f"rho > 0.9 below ell {low}, SNR < 1 {drop} multipoles earlier, "
     text += f"power at ell >= 25 times {fine:.2f}"
@@ -289,8 +288,7 @@ def _resolution(cases: Cases) -> Verdict:
 
 
 def _five_degrees(cases: Cases) -> Verdict:
-    best = max(cross(case) for case in bands(cases))
-    longest = cross(cases["three_cycles"])
+    best, longest = max(cross(case) for case in bands(cases)), cross(cases["three_cycles"])
     text = f"best band ell {best} ({180 / best:.1f} degrees); "
     text += f"three cycles at 25 MHz: {longest} ({180 / longest:.1f} degrees)"
     return grade(text, best >= 32, max(best, longest) >= 25)
@@ -299,8 +297,7 @@ def _five_degrees(cases: Cases) -> Verdict:
 def _kept(cases: Cases, *names: str) -> Verdict:
     """Whether cases keep rho > 0.9 up to ell 10 (partly: 5), with ell_cross within 10."""
     low = [first_below(cases[name]["rho"].values, 0.9) for name in names]
-    first = [cross(cases[name]) for name in names]
-    fiducial = cross(cases["fiducial"])
+    first, fiducial = [cross(cases[name]) for name in names], cross(cases["fiducial"])
     near = all(abs(ell - fiducial) <= 10 for ell in first)
     each = zip(names, low, first, strict=True)
     text = ", ".join(f"{name}: rho < 0.9 from ell {a}, SNR < 1 from {b}" for name, a, b in each)

@@ -256,9 +256,10 @@ class MapResult(Described):
         """Lines for a terminal: remarks, then the verdict and the main numbers.
 
         Details of the verdict, its causes, prior and unknowns come first, unless the verdict is
-        "consistent" and ``verbose`` is false.
+        "consistent", without any usual mistake that fits better, and ``verbose`` is false.
         """
-        details = self._details() if verbose or self.fit.level != "consistent" else []
+        found = any(c.diagnosis is not None and c.diagnosis.proposals for c in self.channels)
+        details = self._details() if verbose or found or self.fit.level != "consistent" else []
         remarks = *self.doubts(), *self.gaps(), *self._flags()
         return [*details, *remarks, self.fit.headline, self.headline()]
 

@@ -47,8 +47,7 @@ def expected_snr_squared(posterior: Posterior) -> Float[np.ndarray, " ells"]:
 
     NaN at an ell where the prior has no power.
     """
-    prior = sum_over_m(posterior.prior.variance())
-    left = sum_over_m(posterior.std() ** 2)
+    prior, left = sum_over_m(posterior.prior.variance()), sum_over_m(posterior.std() ** 2)
     return np.divide(prior, left, out=np.full_like(prior, np.nan), where=left > 0) - 1.0
 
 

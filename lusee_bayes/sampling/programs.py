@@ -126,8 +126,7 @@ class Program:
         for name in names:
             if name != DATA and name not in pieces:
                 raise InputError(
-                    f"the program '{self.name}' asks for '{name}', a piece of an experiment; "
-                    "give arguments() the experiment's pieces"
+                    f"the program '{self.name}' asks for '{name}'; give arguments() this piece"
                 )
         return {name: pieces[name]() for name in names if name != DATA}
 

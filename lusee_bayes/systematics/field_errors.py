@@ -203,6 +203,13 @@ class FieldErrors(ChangedBeams):
     def learns(self) -> bool:
         return self.expectation.learned
 
+    @property
+    def size(self) -> float:
+        """Standard deviation over the scenario's."""
+        expected = self.expectation
+        as_expected = of_ell(expected.std, expected.slope, expected.lmax)
+        return float(np.asarray(self.of_ell)[0] / as_expected[0])
+
     def relearned(self, mean: Vector, variance: Vector) -> dict[str, float]:
         """Learn the standard deviation from the posterior of the amplitudes.
 
@@ -211,10 +218,9 @@ class FieldErrors(ChangedBeams):
         mean, variance : (n,) array
             In prior standard deviations.
         """
-        expected = self.expectation
-        now = np.asarray(self.of_ell)[0] / of_ell(1.0, expected.slope, expected.lmax)[0]
+        least, now = self.expectation.std, self.size * self.expectation.std
         std = float(now * np.sqrt(np.mean(mean**2 + variance)))
-        return {STD: min(max(std, expected.std), LARGEST)}
+        return {STD: min(max(std, least), LARGEST)}
 
 
 def of_ell(std: float, slope: float, lmax: int) -> Float[np.ndarray, " ells"]:

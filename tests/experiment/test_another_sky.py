@@ -267,6 +267,13 @@ def test_a_cause_is_named_even_if_the_simulated_sky_ends_at_lmax():
 # antennas one and a half, and half, of their standard deviations from the expected ones
 OFF = "beam.surface_permittivity=3.98", "beam.zenith_angle_deg=75.3"
 NOTHING = wrong_data.Wrong("nothing", "", wrong_data.measured)
+ABSORBED = (
+    "noise 4 times as large",
+    "noise a quarter",
+    "02I 2 % too high",
+    "port 2 3 % too high",
+    "constant in the autos",
+)
 PLAIN = "imaginary parts conjugated", "ports 0 and 2 exchanged", "one time 50 % too low"
 
 
@@ -320,16 +327,16 @@ def test_unknown_antennas_do_not_absorb_a_mistake(name):
     "wrong",
     [
         pytest.param(NOTHING, marks=pytest.mark.essential),
-        *(pytest.param(w, marks=pytest.mark.long) for w in wrong_data.WRONG if "noise" in w.name),
+        *(pytest.param(w, marks=pytest.mark.long) for w in wrong_data.WRONG if w.name in ABSORBED),
     ],
 )
-def test_fields_as_expected_do_not_look_like_less_noise(wrong, tmp_path):
+def test_what_unknown_fields_absorb_is_named(wrong, tmp_path):
     """Without errors of the fields, many of the data scatter less than the model expects."""
     data, scenario = of_other_antennas(wrong)
     (found,) = lb.run_map(scenario, tmp_path / "run", data=data).result.channels
     named = found.diagnosis is not None and is_named(wrong, found.diagnosis)
-    assert found.judged.level == ("consistent" if wrong is NOTHING else "does not fit")
     assert named == (wrong is not NOTHING)
+    assert named or found.judged.level == "consistent"
 
 
 @pytest.mark.long

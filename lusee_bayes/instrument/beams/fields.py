@@ -467,8 +467,7 @@ def from_rings(
         series[..., ring, :] = spectrum[..., orders % n] * np.exp(-1j * orders * first_phi[ring])
     spread = np.empty((*pixels.shape[:-1], len(theta), len(orders)), dtype=np.complex128)
     for m in range(2 * nside):
-        enough = np.flatnonzero(sizes > 2 * m)
-        both = 2 * nside - 1 + np.unique([-m, m])
+        enough, both = np.flatnonzero(sizes > 2 * m), 2 * nside - 1 + np.unique([-m, m])
         rings = series[..., enough, :][..., both]
         # at the zenith every order but 0 is zero
         zenith = np.zeros(min(m, 1))
