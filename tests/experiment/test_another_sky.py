@@ -267,13 +267,6 @@ def test_a_cause_is_named_even_if_the_simulated_sky_ends_at_lmax():
 # antennas one and a half, and half, of their standard deviations from the expected ones
 OFF = "beam.surface_permittivity=3.98", "beam.zenith_angle_deg=75.3"
 NOTHING = wrong_data.Wrong("nothing", "", wrong_data.measured)
-ABSORBED = (
-    "noise 4 times as large",
-    "noise a quarter",
-    "02I 2 % too high",
-    "port 2 3 % too high",
-    "constant in the autos",
-)
 PLAIN = "imaginary parts conjugated", "ports 0 and 2 exchanged", "one time 50 % too low"
 
 
@@ -323,11 +316,14 @@ def test_unknown_antennas_do_not_absorb_a_mistake(name):
     assert is_named(wrong, named) and named.sentences()[0].startswith("Explains most of chi2")
 
 
+SOME = [w for w in wrong_data.WRONG if w.name.startswith(("noise", "02I", "port 2 ", "constant"))]
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
         pytest.param(NOTHING, marks=pytest.mark.essential),
-        *(pytest.param(w, marks=pytest.mark.long) for w in wrong_data.WRONG if w.name in ABSORBED),
+        *(pytest.param(one, marks=pytest.mark.long) for one in SOME),
     ],
 )
 def test_what_unknown_fields_absorb_is_named(wrong, tmp_path):
