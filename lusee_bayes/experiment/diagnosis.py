@@ -551,6 +551,7 @@ def _tried(judge: UnderAnySky, residuals: Residuals, unused: float = 0.0) -> Dia
     """Try the usual mistakes on data under a model whose unknowns leave some degrees unused."""
     setup, data = judge.setup, judge.around.data
     base, solution = judge.wide(judge.model.coupling)
+    fits = base.allowing(unused).fits
 
     def best(tried: Sequence[tuple[float, object]], most: float) -> list:
         """The mistakes with the smallest chi^2, below ``most``."""
@@ -578,10 +579,10 @@ def _tried(judge: UnderAnySky, residuals: Residuals, unused: float = 0.0) -> Dia
     suffice = [one for one in (*proposals, *others) if one.suffices(base)]
     # these always absorb part of any misfit, and count only if they absorb all of it
     for absorbing in _finer(judge), _noise_level(residuals, data), _noise_of(judge, "paper"):
-        if not suffice:
+        if not (suffice or fits):
             others += (last := list(absorbing))
             suffice = [one for one in last if one.suffices(base)]
-    listed = sorted(suffice or ([] if base.fits else nearly), key=lambda one: one.chi2.chi2)
+    listed = sorted(suffice or ([] if fits else nearly), key=lambda one: one.chi2.chi2)
     most = max((one.gained(base) for one in listed), default=0.0)
     listed = [
         replace(one, chi2=one.chi2.allowing(unused))

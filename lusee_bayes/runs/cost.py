@@ -108,8 +108,7 @@ def _operations_a_second() -> float:
 
 def simulation_cost(scenario: Scenario, n_channels: int = 1) -> Cost:
     """Estimate the resources for simulating a scenario's visibilities."""
-    n_data = 16 * scenario.observation.n_samples()
-    n_modes = (scenario.lmax + 1) ** 2
+    n_data, n_modes = 16 * scenario.observation.n_samples(), (scenario.lmax + 1) ** 2
     memory = BASE_BYTES + n_channels * n_data * BYTES_A_DATUM + 64.0 * n_modes
     return Cost(n_data, n_modes, n_channels, memory, 100.0 * n_channels * (n_data + n_modes))
 

@@ -469,8 +469,7 @@ def _null_eigenvalues(white: Skies, rng: np.random.Generator) -> Float[np.ndarra
     unit = white / np.linalg.norm(white, axis=2, keepdims=True)
     cosine = (unit[:, 1:] * unit[:, :-1]).sum(2)
     # not sqrt(1 - cosine^2), which rounding makes imaginary if a draw is repeated
-    sine = np.linalg.norm(unit[:, 1:] - cosine[..., None] * unit[:, :-1], axis=2)
-    runs = []
+    sine, runs = np.linalg.norm(unit[:, 1:] - cosine[..., None] * unit[:, :-1], axis=2), []
     for _ in range(NULL_RUNS):
         chains = rng.standard_normal(white.shape)
         for t in range(1, white.shape[1]):

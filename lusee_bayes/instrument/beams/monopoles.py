@@ -264,8 +264,7 @@ class Monopoles(BeamSource, eqx.Module):
         xp = namespace(a)
         sinc_a, sinc_b = xp.sinc(a / np.pi), xp.sinc(b / np.pi)
         real = xp.sin(b) * sinc_a + xp.sin(a) * sinc_b
-        imaginary = xp.cos(a) * sinc_b - xp.cos(b) * sinc_a
-        half = self.length_m / 2.0
+        imaginary, half = xp.cos(a) * sinc_b - xp.cos(b) * sinc_a, self.length_m / 2.0
         return as_complex(real * half, imaginary * half)
 
 
