@@ -564,7 +564,7 @@ def gallery_turntable() -> None:
     angles, bias = (0, 3, 7.5, 15, 22.5, 30, 37.5, 45, 52.5, 60, 67.5, 75, 82.5, 87, 90), []
     for angle in angles:
         setup, found = planned((0.5, 0.0), (0.5, angle))
-        spots = blind_spots(setup, found, np.asarray(setup.sky.modes), pointing=False)
+        spots = blind_spots(setup, found, np.asarray(setup.sky.modes))
         told = {spot.name: spot.unnoticed for spot in spots}
         bias.append([told[name][1] for name in names])
         print(angle, {name: f"{told[name][0]:.2g} %, {told[name][1]:.3g}" for name in names})

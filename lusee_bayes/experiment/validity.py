@@ -47,15 +47,15 @@ N_WEIGHED, N_FIRST, LARGEST_K = 100, 25, 0.7
 EVEN = 0.3
 # a move of the map (rms, in standard deviations) that enlarges its error by a twentieth
 LARGEST_MOVE = 0.3
-# relative errors of the fields, and of each parameter of the antennas
-FIELDS, PARAMETERS = 1e-3, 1e-2
+# relative errors of the fields and of each parameter of the antennas, and an error of the clock
+FIELDS, PARAMETERS, CLOCK_S = 1e-3, 1e-2, 600.0
 # highest ell of field errors, enough to show whether they have an effect
 FIELD_LMAX = 3
 # excess of the residual chi^2 that is noticed, in its standard deviations
 SEEN = 3.0
 FIELDS_NAME = "the ports' fields"
-# a smaller rise of chi^2 is only rounding: the sky absorbs the error completely
-NOTHING = 1e-3
+# a smaller rise of chi^2, over the bias squared, is only rounding: the sky absorbs all of the error
+NOTHING = 1e-6
 # the sky above lmax is not reported if it adds less, in standard deviations of the noise
 LITTLE = 0.1
 # largest number of errors in a sentence
@@ -167,11 +167,12 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     return (
         f"Residual chi2 would not reveal an error of {named}, which the model takes as exact. In "
         "brackets: by how many standard deviations it would shift the map (rms over independent "
-        "directions). Add noise.beam.parameters or noise.fields, or more turntable angles."
+        "directions). Give noise.pointing, noise.beam.parameters or noise.fields, or use more "
+        "turntable angles."
     )
 
 
-def errors_of(setup: Setup, *, pointing: bool) -> Iterator[tuple[Systematic, Sizes, str]]:
+def errors_of(setup: Setup) -> Iterator[tuple[Systematic, Sizes, str]]:
     """Systematics that a model may lack, with size and unit of the errors that they describe.
 
     There is one error for each unknown, or one for all of them.
@@ -184,15 +185,11 @@ def errors_of(setup: Setup, *, pointing: bool) -> Iterator[tuple[Systematic, Siz
     priors = tuple(Unknown(name, value, PARAMETERS * abs(value)) for name, value in values.items())
     sizes = dict.fromkeys(values, 100.0 * PARAMETERS)
     yield InstrumentParameters(priors, setup.instrument), sizes, " %"
-    if not pointing:
-        return
-    steps = tested_offsets(setup)
+    steps = tested_offsets(setup) | {"clock_s": CLOCK_S}
     yield PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0)), steps, ""
 
 
-def blind_spots(
-    setup: Setup, inference: Inference, sky: Modes, *, pointing: bool = True
-) -> tuple[BlindSpot, ...]:
+def blind_spots(setup: Setup, inference: Inference, sky: Modes) -> tuple[BlindSpot, ...]:
     """Compute the effect of instrument errors that the model does not include.
 
     Parameters
@@ -201,8 +198,6 @@ def blind_spots(
     inference : Inference
     sky : (modes,) array
         In K.
-    pointing : bool
-        Include clock and pointing, besides fields and antennas.
     """
     has = {name for part in inference.expanded for name in part.systematic.names}
     if any(isinstance(part.systematic, FieldErrors) for part in inference.expanded):
@@ -211,7 +206,7 @@ def blind_spots(
     solution, model = inference.solution, base_model(moved_setup, inference.around)
     root, wide = solution.posterior.root(), inference.under_any_sky().posterior.root()
     spots, degrees = [], max(inference.model.n_data - len(sky), 1)
-    for systematic, sizes, unit in errors_of(moved_setup, pointing=pointing):
+    for systematic, sizes, unit in errors_of(moved_setup):
         if has.issuperset(sizes):
             continue
         columns = np.asarray(systematic.linearised(model, np.zeros(len(systematic.names)))(sky))
@@ -263,6 +258,6 @@ def reach(experiment: Experiment, inference: Inference) -> list[str]:
             f"standard deviations (rms), so that {holds}; treatment=sampled needs no Gaussian."
         )
     if setup.measured:
-        spots = blind_spots(setup, inference, inference.posterior.mean, pointing=False)
+        spots = blind_spots(setup, inference, inference.posterior.mean)
         sentences += filter(None, [blind_sentence(spots)])
     return sentences

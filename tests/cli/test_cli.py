@@ -63,8 +63,7 @@ def test_the_files_agree_with_each_other(folder):
     covariance = posterior["covariance"].values[0]
     # rounding of products of numbers that span 1e10 in the covariance
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std, rtol=1e-7)
-    nside = 8
-    columns = healpy.read_map(folder / "map.fits", field=None, dtype=np.float64)
+    nside, columns = 8, healpy.read_map(folder / "map.fits", field=None, dtype=np.float64)
     kelvin, got, observed, truth, residual, *drawn = columns
     np.testing.assert_allclose(kelvin, modes_to_map(mean, nside), rtol=1e-12)
     y = pixel_matrix(nside, 8)
