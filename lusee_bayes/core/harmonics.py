@@ -215,8 +215,7 @@ def averaging_rows(
     (regions, modes) array
         Zero for a region without pixels; exact for the whole sphere.
     """
-    n = inside.shape[1]
-    options = {"lmax": lmax, "iter": 0, "use_pixel_weights": False}
+    n, options = inside.shape[1], {"lmax": lmax, "iter": 0, "use_pixel_weights": False}
     sums = [from_healpy(healpy.map2alm(one.astype(np.float64), **options)) for one in inside]
     rows = np.stack(sums) * n / (4.0 * np.pi * np.fmax(inside.sum(1), 1))[:, None]
     rows[inside.all(1)] = np.eye(1, rows.shape[1]) / np.sqrt(4.0 * np.pi)

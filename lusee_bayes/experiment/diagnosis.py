@@ -390,8 +390,7 @@ class MixedProducts:
         for time, bend in zip(worst.tolist(), curvature.tolist(), strict=True):
             if not bend > 0.0:  # other times do not predict this one
                 continue
-            factor = 1.0 - pull[time] / bend
-            when = data.observation.times[time].isot[:19]
+            factor, when = 1.0 - pull[time] / bend, data.observation.times[time].isot[:19]
             times = _number(1.0 / factor, bend**-0.5)
             wrong = f"all products at {when} are {times} times the prediction from other times"
             right = weights(factor * np.eye(len(self.grid)))

@@ -264,8 +264,7 @@ def spectra_observation(scenario: Scenario, window_s: float) -> Observation:
     # spectra are means, independent of the scenario's observation.window
     planned = scenario.observation.model_copy(update={"window": "mean"}).observation()
     bounds, live = planned.windows.bounds_s, planned.windows.live_per_sample_s
-    whole = live > (bounds[:, 1] - bounds[:, 0]) * (1.0 - 1e-9)
-    half = window_s / 2.0
+    whole, half = live > (bounds[:, 1] - bounds[:, 0]) * (1.0 - 1e-9), window_s / 2.0
     long = whole & (bounds[:, 0] <= -half + 1e-6) & (bounds[:, 1] >= half - 1e-6)
     if not long.any():
         raise InputError(

@@ -21,10 +21,11 @@ mean map by C A^T N^-1 T z. It raises the residual chi^2, the part that no sky c
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Modes
 from lusee_bayes.core.engine import in_threads
@@ -34,10 +35,12 @@ from lusee_bayes.experiment.model import base_model, moved, systematics
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.unknowns import tested_offsets
 from lusee_bayes.linear.amplitudes import AmplitudesOfSky
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.systematics.beam import InstrumentParameters
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.field_errors import FieldErrors, FieldErrorsSection
+from lusee_bayes.systematics.horizon import Horizon, HorizonSection
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
 from lusee_bayes.systematics.systematic import Systematic, Unknown
 
@@ -49,6 +52,8 @@ EVEN = 0.3
 LARGEST_MOVE = 0.3
 # relative errors of the fields and of each parameter of the antennas, and an error of the clock
 FIELDS, PARAMETERS, CLOCK_S = 1e-3, 1e-2, 600.0
+# unknown terrain on one side, whose effect grows as the cube of its altitude
+TERRAIN_DEG = 5.0
 # highest ell of field errors, enough to show whether they have an effect
 FIELD_LMAX = 3
 # excess of the residual chi^2 that is noticed, in its standard deviations
@@ -60,8 +65,9 @@ NOTHING = 1e-6
 LITTLE = 0.1
 # largest number of errors in a sentence
 MOST_NAMED = 4
-# size of each error, by name
-Sizes = dict[str, float]
+# sizes of errors, by name, their unit, the power of them that acts, and what is added to the data
+Columns = Float[np.ndarray, "data columns"]
+Errors = tuple[dict[str, float], str, int, Columns]
 
 
 def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float, float] | None:
@@ -99,8 +105,7 @@ def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float
 
     def drawn(k: int) -> None:
         sky, a, kinds = skies[k], off[k], (type(part.systematic) for part in parts)
-        z = dict(zip(kinds, np.split(a + expected, ends), strict=True))
-        model = base
+        z, model = dict(zip(kinds, np.split(a + expected, ends), strict=True)), base
         for systematic in built:
             if type(systematic) in z:
                 model = systematic.effect(model, systematic.values(z[type(systematic)]))
@@ -142,6 +147,8 @@ class BlindSpot:
         Move of the map: rms over independent directions, in posterior standard deviations.
     shown : float
         Rise of the residual chi^2, in standard deviations of chi^2.
+    power : int
+        Of the size, with which the data change.
     """
 
     name: str
@@ -149,44 +156,67 @@ class BlindSpot:
     unit: str
     bias: float
     shown: float
+    power: int = 1
 
     @property
     def unnoticed(self) -> tuple[float, float]:
         """Largest size that the residual chi^2 does not reveal, and the bias of this size."""
         factor = float(np.sqrt(SEEN / max(self.shown, np.finfo(np.float64).tiny)))
-        return self.size * factor, self.bias * factor
+        return self.size * factor ** (1.0 / self.power), self.bias * factor
 
 
 def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     """Errors that would move the map unnoticed, in one sentence; empty if there are none."""
-    unseen = [spot for spot in spots if spot.shown < SEEN and spot.bias > 1.0]
+    unseen = [spot for spot in spots if spot.shown <= SEEN and spot.bias > 1.0]
     if not unseen:
         return ""
     unseen = sorted(unseen, key=lambda spot: -spot.bias)[:MOST_NAMED]
-    named = ", ".join(f"{one.name} by {one.size:g}{one.unit} ({one.bias:.2g})" for one in unseen)
+    named = ", ".join(f"{one.name} by {one.size:.3g}{one.unit} ({one.bias:.2g})" for one in unseen)
     return (
         f"Residual chi2 would not reveal an error of {named}, which the model takes as exact. In "
         "brackets: by how many standard deviations it would shift the map (rms over independent "
-        "directions). Give noise.pointing, noise.beam.parameters or noise.fields, or use more "
-        "turntable angles."
+        "directions). Unknowns (noise.pointing, .horizon, .fields, .beam.parameters) allow for it."
     )
 
 
-def errors_of(setup: Setup) -> Iterator[tuple[Systematic, Sizes, str]]:
-    """Systematics that a model may lack, with size and unit of the errors that they describe.
+def errors_of(setup: Setup, model: LinearGaussian, sky: Modes, has: set[str]) -> Iterator[Errors]:
+    """Errors of the instrument besides unknowns that it has: the names of these are ``has``.
 
-    There is one error for each unknown, or one for all of them.
+    Parameters
+    ----------
+    setup : Setup
+    model : LinearGaussian
+        Without unknowns.
+    sky : (modes,) array
+        In K.
+    has : set of str
     """
+
+    def columns(systematic: Systematic) -> Columns:
+        centre = np.zeros(len(systematic.names))
+        return np.asarray(systematic.linearised(model, centre)(sky))
+
     source = setup.beam_source
-    if source.has_fields:
+    if source.has_fields and FieldErrors.treatment(setup.scenario) in (None, "ignored"):
         section = FieldErrorsSection(std=FIELDS, lmax=FIELD_LMAX, learned=False)
-        yield FieldErrors.build(section, setup, Around()), {FIELDS_NAME: 100.0 * FIELDS}, " %"
-    values = {name: float(p.value) for name, p in source.parameters().items() if float(p.value)}
-    priors = tuple(Unknown(name, value, PARAMETERS * abs(value)) for name, value in values.items())
-    sizes = dict.fromkeys(values, 100.0 * PARAMETERS)
-    yield InstrumentParameters(priors, setup.instrument), sizes, " %"
-    steps = tested_offsets(setup) | {"clock_s": CLOCK_S}
-    yield PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0)), steps, ""
+        fields = FieldErrors.build(section, setup, Around())
+        yield {FIELDS_NAME: 100.0 * FIELDS}, " %", 1, columns(fields)
+    values = {name: float(p.value) for name, p in source.parameters().items() if name not in has}
+    priors = tuple(Unknown(n, v, PARAMETERS * abs(v)) for n, v in values.items() if v)
+    if priors:
+        sizes = {unknown.name: 100.0 * PARAMETERS for unknown in priors}
+        yield sizes, " %", 1, columns(InstrumentParameters(priors, setup.instrument))
+    steps = {name: step for name, step in tested_offsets(setup).items() if name not in has}
+    if steps:
+        steps |= {"clock_s": CLOCK_S} if "clock_s" in steps else {}
+        offsets = PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0))
+        yield steps, "", 1, columns(offsets)
+    if setup.hidden is None:
+        half = TERRAIN_DEG / 2.0
+        terrain = HorizonSection(altitude_deg=half, std_deg=half, harmonics=1, treatment="ignored")
+        behind = Horizon.moved(terrain, setup, {"horizon_cos_1_deg": half}).coupling
+        more = np.asarray(behind @ sky - model.coupling @ sky)
+        yield {"horizon_deg": TERRAIN_DEG}, "", 3, more[:, None]
 
 
 def blind_spots(setup: Setup, inference: Inference, sky: Modes) -> tuple[BlindSpot, ...]:
@@ -200,16 +230,11 @@ def blind_spots(setup: Setup, inference: Inference, sky: Modes) -> tuple[BlindSp
         In K.
     """
     has = {name for part in inference.expanded for name in part.systematic.names}
-    if any(isinstance(part.systematic, FieldErrors) for part in inference.expanded):
-        has.add(FIELDS_NAME)
     moved_setup = moved(setup, inference.around.values)
     solution, model = inference.solution, base_model(moved_setup, inference.around)
     root, wide = solution.posterior.root(), inference.under_any_sky().posterior.root()
     spots, degrees = [], max(inference.model.n_data - len(sky), 1)
-    for systematic, sizes, unit in errors_of(moved_setup):
-        if has.issuperset(sizes):
-            continue
-        columns = np.asarray(systematic.linearised(model, np.zeros(len(systematic.names)))(sky))
+    for sizes, unit, power, columns in errors_of(moved_setup, model, sky, has):
         solved = np.asarray(solution.factor.solve(columns))
         pull = np.asarray(inference.model.coupling.transpose_mv(solved))
         moves = ((root.T @ pull) ** 2).sum(0)
@@ -217,8 +242,11 @@ def blind_spots(setup: Setup, inference: Inference, sky: Modes) -> tuple[BlindSp
         moves, left = (x.reshape(len(sizes), -1).sum(1) for x in (moves, left))
         bias, shown = np.sqrt(moves / len(sky)), left / np.sqrt(2.0 * degrees)
         for k, (name, size) in enumerate(sizes.items()):
-            if name not in has:
-                spots.append(BlindSpot(name, size, unit, float(bias[k]), float(shown[k])))
+            spot = BlindSpot(name, size, unit, float(bias[k]), float(shown[k]), power)
+            if power > 1 and spot.shown > SEEN:  # state the largest that is not noticed
+                size, more = spot.unnoticed
+                spot = replace(spot, size=size, bias=more, shown=SEEN)
+            spots.append(spot)
     return tuple(spots)
 
 

@@ -186,8 +186,7 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
     averaging, (bands, gains, lines) = session.AVERAGING[navgf], _prepared(recipe, navgf, levels)
     share, saturated = source.share[rows_read], source.saturated[rows_read]
     # a spectrum of no frames has no finite values
-    frames = np.maximum(source.frames[rows_read], 1.0)
-    comb = source.notched[rows_read]
+    frames, comb = np.maximum(source.frames[rows_read], 1.0), source.notched[rows_read]
     if recipe.section.comb == "found":
         autos = counts[:, : session.PORTS].astype(np.float64)
         middles = session.channel_mhz(recipe.section.bin_origin)

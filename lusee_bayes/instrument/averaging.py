@@ -286,8 +286,7 @@ def by_the_rule(present: GridFlags, bin_of: Samples, live_s: Times) -> tuple[Bin
     live_s : (times,) array
         Live time of the samples, in seconds.
     """
-    some = present.any(axis=0)
-    first = np.searchsorted(bin_of, np.arange(bin_of[-1] + 1))
+    some, first = present.any(axis=0), np.searchsorted(bin_of, np.arange(bin_of[-1] + 1))
     total = np.add.reduceat(live_s * some, first)
     share = np.add.reduceat(live_s * present, first, axis=1)
     # rounding may put an exact half slightly below it
@@ -310,8 +309,7 @@ def binned(observation: Observation, keep: TimeFlags, bin_of: Samples, to_s: flo
         Length of the bins, in seconds.
     """
     bins, bin_of = np.unique(bin_of[keep], return_inverse=True)
-    first = np.searchsorted(bin_of, np.arange(len(bins)))
-    kept = observation.select(keep)
+    first, kept = np.searchsorted(bin_of, np.arange(len(bins))), observation.select(keep)
     windows, seconds = kept.windows, seconds_from(kept.times[0], kept.times)
     offset = seconds[windows.sample]
     start, end = windows.start_s + offset, windows.end_s + offset

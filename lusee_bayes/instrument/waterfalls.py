@@ -393,8 +393,7 @@ def write_waterfall(
         raise InputError(
             f"{path}: luseepy's reader needs at least two channels; give --frequencies, or {HINT}"
         )
-    data = _kelvin(path, channels)
-    seconds = times.seconds_from(first.times[0], first.times)
+    data, seconds = _kelvin(path, channels), times.seconds_from(first.times[0], first.times)
     if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > times.ROUNDING_S:
         raise InputError(
             f"{path}: luseepy's waterfalls need samples every {first.step_s:g} s; {HINT}"

@@ -126,8 +126,7 @@ def windows(lmax: int) -> Float[np.ndarray, "bands ells"]:
     lmax : int
         Last ell of the last window.
     """
-    ell = np.arange(1.0, lmax + 1.0)
-    n = max(1, int(np.floor(np.log2(lmax / 1.5))) + 1)
+    ell, n = np.arange(1.0, lmax + 1.0), max(1, int(np.floor(np.log2(lmax / 1.5))) + 1)
     edges = lmax / 2.0 ** np.arange(n - 1, 0, -1)
     # the fraction of each ell that is below an edge, which falls over an octave
     below = np.cos(0.5 * np.pi * np.clip(np.log2(ell[None] / edges[:, None]), 0.0, 1.0)) ** 2

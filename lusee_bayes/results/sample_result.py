@@ -101,8 +101,7 @@ class SampleResult:
 
     def lines(self) -> list[str]:
         """Lines for a terminal."""
-        table = self.summary.rename_axis("quantity").reset_index()
-        figures = self.figures()
+        table, figures = self.summary.rename_axis("quantity").reset_index(), self.figures()
         columns = {name: table[name].to_numpy() for name in table}
         reasons = warnings_of(columns, **figures.model_dump(include={"chains", "divergences"}))
         return [self.headline(), *reasons, *self.experiment.doubts]

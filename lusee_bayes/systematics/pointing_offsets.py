@@ -221,8 +221,7 @@ def _slopes(offsets: PointingOffsets, centre: Array) -> tuple[Array, Array, Arra
     """The orientation, and its derivative and that of the sources' signal by the offsets."""
 
     def seen(z: Array) -> tuple[Array, Array | None]:
-        orientation = offsets.orientation(offsets.values(z))
-        sources = offsets.sources
+        orientation, sources = offsets.orientation(offsets.values(z)), offsets.sources
         return orientation, None if sources is None else sources.seen(orientation, offsets.layout)
 
     return seen(centre)[0], *jax.jacfwd(seen)(centre)

@@ -181,8 +181,7 @@ def source_responses(
     if not scenario.sources.list:
         return ()
     instants, sample, weight = observation.at_nodes(SOURCE_NODES)
-    first = np.searchsorted(sample, np.arange(observation.n_times))
-    responses = []
+    first, responses = np.searchsorted(sample, np.arange(observation.n_times)), []
     for one in scenario.sources.list:
         towards, antennas = one.direction(instants), beams.monopoles
         seen = source_response(instants, towards, frequency_mhz, antennas, stokes_v=one.stokes_v)

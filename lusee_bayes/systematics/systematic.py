@@ -578,8 +578,7 @@ class Expanded(Marginalised):
 
 def shrunk_mean(terms: Float[np.ndarray, "terms n"], doubt: float) -> Vector:
     """The mean over terms, less where it does not exceed ``doubt`` standard errors by far."""
-    mean = terms.mean(0)
-    error = doubt * terms.std(0, ddof=1) / np.sqrt(len(terms))
+    mean, error = terms.mean(0), doubt * terms.std(0, ddof=1) / np.sqrt(len(terms))
     return mean * np.clip(1.0 - (error / np.where(mean == 0.0, np.inf, mean)) ** 2, 0.0, 1.0)
 
 

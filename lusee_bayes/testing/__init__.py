@@ -360,8 +360,7 @@ def check_prior(prior: Prior, covariance: np.ndarray, mean: np.ndarray | None = 
     close(traced["columns"], a @ root)
     close(traced["sandwich"], root.T @ inputs[3] @ root)
     close(traced["colour_covariance"], root @ inputs[2] @ root.T)
-    expected = np.zeros(n) if mean is None else mean
-    powerless = np.diag(covariance) == 0
+    expected, powerless = np.zeros(n) if mean is None else mean, np.diag(covariance) == 0
     for one in (on_host(prior), on_device(prior)):
         back = np.asarray(one.whiten(one.colour(u)))
         close(back, np.where(powerless, 0.0, u))

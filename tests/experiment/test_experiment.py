@@ -43,8 +43,7 @@ def test_flagged_data_are_left_out_of_a_and_n(small_experiment):
     setup, whole = small_experiment.setup, small_experiment.data
     flags = np.zeros((16, setup.observation.n_times), dtype=bool)
     flags[3, 5] = flags[:, 10] = True
-    gapped = lb.build(small_experiment.scenario, flagged(whole, flags))
-    keep = ~flags.ravel()
+    gapped, keep = lb.build(small_experiment.scenario, flagged(whole, flags)), ~flags.ravel()
     rows = np.asarray(setup.coupling.dense())[keep]
     np.testing.assert_array_equal(gapped.setup.coupling.dense(), rows)
     np.testing.assert_array_equal(variances(gapped.setup), variances(setup)[keep])

@@ -108,8 +108,7 @@ def test_gains_are_about_what_antennas_with_found_values_would_see():
 def test_beam_parameters_are_directions_of_one_sigma():
     """About the sky and the values that were found."""
     setup, found = experiment(PARAMETERS).setup, inferred(PARAMETERS)
-    expected = np.diag(np.asarray(radiometer(setup).diagonal()))
-    values = found.around.values
+    expected, values = np.diag(np.asarray(radiometer(setup).diagonal())), found.around.values
     assert isinstance(found.model.noise, LowRankUpdate) and len(values) == 2
     for name, sigma in {"length_m": 0.1, "zenith_angle_deg": 2.0}.items():
         steps = (values | {name: values[name] + step} for step in (1e-4, -1e-4))

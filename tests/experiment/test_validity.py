@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from experiments import rms_of_directions
 
@@ -36,6 +37,21 @@ def spots(plain):
 ERRORS = [("surface_permittivity", 3.7, 0.037), ("tilt_north_deg", 0.0, 0.1)]
 
 
+def check_effect(plain, spot, more, rel, rel_shown):
+    """The spot's bias and rise of chi^2 are those of the change ``more`` of the data."""
+    experiment, found = plain
+    d, sky = np.asarray(experiment.data.data), found.posterior.mean
+    shift = found.model.condition(d + more).posterior.mean - found.model.condition(d).posterior.mean
+    c = np.asarray(found.posterior.covariance())
+    bias = np.sqrt(shift @ np.linalg.solve(c, shift) / len(sky))
+    std = np.sqrt(np.asarray(found.model.noise.diagonal()))
+    a, white = np.asarray(found.model.coupling.dense()) / std[:, None], more / std
+    left = white - a @ np.linalg.lstsq(a, white, rcond=None)[0]
+    shown = left @ left / np.sqrt(2.0 * (len(d) - len(sky)))
+    assert spot.bias == pytest.approx(bias, rel=rel)
+    assert spot.shown == pytest.approx(shown, rel=rel_shown)
+
+
 @pytest.mark.parametrize(("name", "centre", "size"), ERRORS)
 def test_what_an_error_does_is_what_it_does_to_data(plain, spots, name, centre, size):
     """Data with the error in them, mapped without it; chi^2 of what no sky of any size explains.
@@ -43,24 +59,26 @@ def test_what_an_error_does_is_what_it_does_to_data(plain, spots, name, centre, 
     A tenth of it, of both signs, is linear to 1e-3; a prior
     100 times as wide is none to 1e-4 of what the data determine, and to 1 % of what they hardly do.
     """
-    experiment, found = plain
     section = {"surface_permittivity": "beam={parameters: {surface_permittivity: 0.1}}"}
     term = "noise." + section.get(name, "pointing={tilt_north_deg: 1}")
     scenario = scenario_of(ISOTROPIC, term, lmax=6, step_s=43200.0)
-    sky = found.posterior.mean
-    steps = size / 10.0, -size / 10.0
+    steps, sky = (size / 10.0, -size / 10.0), plain[1].posterior.mean
     above, below = (moved(set_up(scenario), {name: centre + step}) for step in steps)
     more = 5.0 * (np.asarray(above.coupling @ sky) - np.asarray(below.coupling @ sky))
-    d = np.asarray(experiment.data.data)
-    shift = found.model.condition(d + more).posterior.mean - found.model.condition(d).posterior.mean
-    c = np.asarray(found.posterior.covariance())
-    bias = np.sqrt(shift @ np.linalg.solve(c, shift) / len(sky))
-    assert spots[name].bias == pytest.approx(bias, rel=1e-3)
-    std = np.sqrt(np.asarray(found.model.noise.diagonal()))
-    a, white = np.asarray(found.model.coupling.dense()) / std[:, None], more / std
-    left = white - a @ np.linalg.lstsq(a, white, rcond=None)[0]
-    degrees = len(d) - len(sky)
-    assert spots[name].shown == pytest.approx(left @ left / np.sqrt(2.0 * degrees), rel=0.05)
+    check_effect(plain, spots[name], more, 1e-3, 0.05)
+
+
+def test_terrain_that_nothing_reveals(plain, spots, tmp_path):
+    """On one side, of the altitude that just is not seen: the cube holds to a fifth."""
+    azimuth, spot = np.arange(360.0), spots["horizon_deg"]
+    altitude = spot.size * (1.0 + np.cos(np.radians(azimuth))) / 2.0
+    table = pd.DataFrame({"azimuth_deg": azimuth, "altitude_deg": altitude})
+    table.to_csv(tmp_path / "terrain.csv", index=False)
+    terrain = f"noise.horizon={{file: {tmp_path / 'terrain.csv'}, std_deg: 1, treatment: ignored}}"
+    setup = set_up(scenario_of(ISOTROPIC, terrain, lmax=6, step_s=43200.0))
+    (experiment, found), seen = plain, setup.coupling @ plain[1].posterior.mean
+    more = np.asarray(seen - experiment.setup.coupling @ found.posterior.mean)
+    check_effect(plain, spot, more, 0.2, 0.4)
 
 
 def test_a_clock_that_is_off_turns_the_sky_alone(spots):

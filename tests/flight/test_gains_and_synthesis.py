@@ -168,7 +168,6 @@ def test_visibilities_that_voltages_cannot_have_are_refused():
 def test_counts_are_whole_numbers_of_few_enough_bits():
     spectra = np.abs(np.random.default_rng(4).normal(size=(3, 16, 100))) * 0.7
     slices, autos = bit_slices(spectra), OF_FLIGHT[[0, 7, 12, 15]]
-    found = rounded(spectra, np.broadcast_to(slices, (3, 16)))
-    step = 2.0 ** (slices - 31)
+    found, step = rounded(spectra, np.broadcast_to(slices, (3, 16))), 2.0 ** (slices - 31)
     np.testing.assert_allclose(found, spectra, rtol=1e-6, atol=step.max())
     assert 2**25 < np.rint(spectra[0, autos] / step[autos, None]).max() < 2**28

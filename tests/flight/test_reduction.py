@@ -60,8 +60,7 @@ def test_values_are_those_of_sums_written_out(flight, reduced, name, row):
     at = {"a": 0, "b": 40, "c": 80}[name] + row
     for band, f in enumerate(F):
         expected, _ = naive_band(flight, name, row, f)
-        scale = np.abs(expected[auto_indices()]).max()
-        found = reduced.values[band, :, at]
+        scale, found = np.abs(expected[auto_indices()]).max(), reduced.values[band, :, at]
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * scale)
 
 

@@ -43,8 +43,7 @@ def newer(tmp_path):
 def test_what_a_session_says(flight):
     assert FLIGHT_PRODUCTS[:6] == ("00R", "11R", "22R", "33R", "01R", "01I")
     assert [FLIGHT_PRODUCTS[k] for k in OF_FLIGHT] == list(labels())
-    session = read_session(flight / "session_b.h5")
-    truth = np.load(flight / "truth.npz")
+    session, truth = read_session(flight / "session_b.h5"), np.load(flight / "truth.npz")
     mine = truth["session"] == "b"
     assert (session.n_rows, session.layout, session.kind) == (40, 3, "HDF5")
     utc = session.clock.utc(session.raw_s)

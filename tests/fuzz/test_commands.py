@@ -216,8 +216,7 @@ def test_any_text_as_an_override(n):
 
 @few_and_many
 def test_any_file_as_a_scenario(n, tmp_path):
-    path = tmp_path / "scenario.yaml"
-    whole = load_scenario("gain_1e-2").to_yaml().encode()
+    path, whole = tmp_path / "scenario.yaml", load_scenario("gain_1e-2").to_yaml().encode()
 
     @settings(max_examples=n)
     @given(

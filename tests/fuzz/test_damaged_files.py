@@ -83,8 +83,7 @@ LUSEEPYS = {
 @pytest.fixture(scope="session")
 def files(tmp_path_factory, small_map, small_cube) -> Path:
     """A file of every kind."""
-    folder = tmp_path_factory.mktemp("files")
-    experiment = lb.build(small_scenario(lmax=2))
+    folder, experiment = tmp_path_factory.mktemp("files"), lb.build(small_scenario(lmax=2))
     experiment.data.write(folder / "visibilities.nc")
     experiment.data.stamped("start").write(folder / "windows.nc")
     channels = [replace(experiment.data, frequency_mhz=f) for f in (20.0, 25.0)]

@@ -155,8 +155,7 @@ def around(n0, g, reach, n_radius, n_angle):
     terms = ((2 * ell + 1) * g[ell] * eval_legendre(ell, cosine) for ell in range(len(g)))
     kernel, across = sum(terms) / (4 * np.pi), np.cross(n0, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
-    other = np.cross(n0, across)
-    alpha = 2 * np.pi * (np.arange(n_angle) + 0.5) / n_angle
+    other, alpha = np.cross(n0, across), 2 * np.pi * (np.arange(n_angle) + 0.5) / n_angle
     offset = np.cos(alpha)[:, None] * across + np.sin(alpha)[:, None] * other
     n = cosine[:, None, None] * n0 + np.sqrt(1 - cosine**2)[:, None, None] * offset
     return n.reshape(-1, 3), np.repeat(kernel * ring, n_angle)

@@ -515,8 +515,7 @@ def test_windows_that_a_file_cannot_have(tmp_path, change, words):
 
 @pytest.mark.parametrize(("timestamp", "shift"), [("start", 0.0), ("middle", -0.5), ("end", -1.0)])
 def test_timestamps(timestamp, shift):
-    observation = made(timestamp=timestamp).observation
-    start = HOUR * (np.arange(4) + shift)
+    observation, start = made(timestamp=timestamp).observation, HOUR * (np.arange(4) + shift)
     # a Julian date in two parts is exact to less than a nanosecond, offsets of hours to 1e-12
     within(bounds_of(observation), np.stack([start, start + HOUR], axis=1), 1e-8)
     np.testing.assert_allclose(observation.windows.bounds_s.sum(axis=1), 0.0, atol=1e-12)

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -250,7 +251,7 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
     (sentence,) = (line for line in lines if line.startswith("One parameter combination"))
     worst = max(nulls, key=lambda frequency: nulls[frequency].share)
     assert f"at 2 of 2 frequencies. At {worst:g} MHz ({nulls[worst].words()}, in" in sentence
-    page = map_page(tmp_path / "cube", "a run")
+    page = unescape(map_page(tmp_path / "cube", "a run"))
     assert line in page and sentence in page
     assert "Powers of receivers" in page and page.count("<td>regolith_k</td><td>K</td>") == 2
 

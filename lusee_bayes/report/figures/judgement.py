@@ -35,7 +35,7 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True, gridspec_kw=places)
     # samples need not be evenly spaced, e.g. between runs or without nights
     x, y = np.arange(len(hours) + 1) - 0.5, np.arange(len(labels) + 1) - 0.5
-    widest = max(WIDEST, float(np.nanpercentile(np.abs(z), 98)))
+    widest = max(WIDEST, float(np.percentile(np.append(np.abs(z[np.isfinite(z)]), 0.0), 98)))
     style = {"cmap": drawing.DIVERGING, "norm": Normalize(-widest, widest), "rasterized": True}
     image, days = left.pcolormesh(x, y, z, **style), np.asarray(hours) / 24.0
     ticks = MaxNLocator(7).tick_values(days[0], days[-1])
