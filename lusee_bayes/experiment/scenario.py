@@ -367,9 +367,9 @@ def _validate(tree: dict[Any, Any], source: str | Path) -> Scenario:
 
 
 def _read_yaml(source: str | Path) -> dict[Any, Any]:
-    names = scenario_names()
-    if os.path.exists(user_path(source)):
-        tree = read_yaml(user_path(source), "a scenario")
+    names, path = scenario_names(), user_path(source)
+    if os.path.isfile(path) or (os.path.exists(path) and str(source) not in names):
+        tree = read_yaml(path, "a scenario")
     elif str(source) in names:
         tree = parse_yaml(scenario_text(str(source)), str(source))
     elif os.sep in str(source) or Path(source).suffix[1:2].isalpha():

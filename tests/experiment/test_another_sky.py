@@ -124,8 +124,7 @@ def pulls_with_drifts(sigma, lmax, top, test_data, measured=lambda scenario: sce
     chi^2 minus its mean in standard deviations.
     """
     file = test_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
-    sky = FileSkySection(file=str(file)).at(10.0, top)
-    term = f"noise.gain={{sigma: {sigma}}}"
+    sky, term = FileSkySection(file=str(file)).at(10.0, top), f"noise.gain={{sigma: {sigma}}}"
     scenario, whole = (wrong_data.scenario(ell, term, frequency_mhz=10.0) for ell in (lmax, top))
     for seed in (1, 2, 3):
 

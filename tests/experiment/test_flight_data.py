@@ -323,8 +323,7 @@ def test_the_map_is_that_of_the_same_data_in_kelvin(flight, truth, mapped):
     scale = np.sqrt([per_kelvin[int(x[0])] * per_kelvin[int(x[1])] for x in labels()])
     bad = {(s, int(r)) for s, r in [*truth["comb"], *truth["saturated"]] if s == "c"}
     names = [(s, int(r)) for s, r in zip(truth["session"], truth["row"], strict=True)]
-    keep = [k for k, name in enumerate(names) if name not in bad]
-    combs = [("d", 4), ("d", 5)]
+    keep, combs = [k for k, name in enumerate(names) if name not in bad], [("d", 4), ("d", 5)]
     made = [naive_band(flight, *names[k], 10.0, comb=names[k] in combs) for k in keep]
     said = {"timestamp": "instant", "step_s": float(truth["integration_s"])}
     said |= {"site": (float(truth["lon_deg"]), float(truth["lat_deg"])), "products": list(labels())}

@@ -36,7 +36,9 @@ def assert_kept(scenario, folder):
 
 
 @pytest.mark.parametrize("name", scenario_names())
-def test_a_resolved_scenario_is_the_same_scenario(name, tmp_path):
+def test_a_resolved_scenario_is_the_same_scenario(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).mkdir()  # results, which do not hide the scenario
     scenario = load_scenario(name, ["seed=7", "observation.runs.0.turntable_deg=12.5"])
     assert_kept(scenario, tmp_path)
     assert (scenario.seed, scenario.observation.runs[0].turntable_deg) == (7, 12.5)
