@@ -171,7 +171,7 @@ def require_files(folder: Path, names: Sequence[str], command: str) -> None:
     for name in names:
         if not (folder / name).is_file():
             raise InputError(
-                f"'{folder}' has no {name}; give a folder made by lusee-bayes {command}, this version"
+                f"'{folder}' has no {name}; give a folder that lusee-bayes {command} made"
             )
 
 
