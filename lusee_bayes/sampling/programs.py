@@ -126,7 +126,7 @@ class Program:
         for name in names:
             if name != DATA and name not in pieces:
                 raise InputError(
-                    f"'{self.name}' asks for '{name}', a piece of an experiment; give it to arguments()"
+                    f"'{self.name}' asks for '{name}': give arguments() this piece of the experiment"
                 )
         return {name: pieces[name]() for name in names if name != DATA}
 
