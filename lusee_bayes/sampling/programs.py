@@ -126,7 +126,7 @@ class Program:
         for name in names:
             if name != DATA and name not in pieces:
                 raise InputError(
-                    f"'{self.name}' asks for '{name}': give arguments() this piece of the experiment"
+                    f"'{self.name}' asks for '{name}': give arguments() this piece of an experiment"
                 )
         return {name: pieces[name]() for name in names if name != DATA}
 
