@@ -581,15 +581,13 @@ def _tried(judge: UnderAnySky, residuals: Residuals, unused: float = 0.0) -> Dia
         if not (suffice or fits):
             others += (last := list(absorbing))
             suffice = [one for one in last if one.suffices(base)]
-    listed = sorted(suffice or ([] if fits else nearly), key=lambda one: one.chi2.chi2)
+    listed = suffice or ([] if fits else nearly)
     most = max((one.gained(base) for one in listed), default=0.0)
-    listed = [
-        replace(one, chi2=one.chi2.allowing(unused))
-        for one in listed
-        if one.gained(base) > COMPARABLE * most
-    ]
+    better = [one for one in listed if one.gained(base) > COMPARABLE * most]
+    better = [replace(one, chi2=one.chi2.allowing(unused)) for one in better]
+    better = sorted(better, key=lambda one: (-one.chi2.p, one.chi2.chi2))
     n_tried = len(of_data) + len(of_model) + len(others)
-    return Diagnosis(base.allowing(unused), tuple(_merged(listed)), n_tried)
+    return Diagnosis(base.allowing(unused), tuple(_merged(better)), n_tried)
 
 
 def _noise_of(judge: UnderAnySky, form: str) -> Iterator[Proposal]:
