@@ -233,7 +233,7 @@ def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) 
     if not data.says_window:
         if timestamp is None:
             raise InputError(
-                f"{path} says nothing about windows: neither time_bounds nor window = 'instant'; "
+                f"{path} does not say what its times mean: no time_bounds, no window = 'instant'; "
                 "use --set observation.timestamp=start (or middle, end, instant)"
             )
         with naming(path):
@@ -331,8 +331,8 @@ def recipe_of(scenario: Scenario) -> Recipe:
     """
     if (section := scenario.flight) is None:
         raise InputError(
-            "the data are sessions of the spectrometer, but the scenario has no section flight; "
-            "add one, or --set 'flight={gain_table: ...}' (docs/howto/first_light.md)"
+            "the scenario has no section flight for sessions of the spectrometer; add one, or "
+            "--set 'flight={gain_table: ..., bin_origin: centre}' (docs/howto/first_light.md)"
         )
     if section.gain_table is None:
         raise InputError(
