@@ -423,7 +423,7 @@ EXPLAINED = 0.03
 # a smaller chi^2 per degree of freedom means that without the mistake N would be far too large
 LEAST = 0.5
 # any mistake must reduce chi^2, or its excess, by more than this number of standard deviations, and
-# is listed if it reduces it by more than this fraction of the best one's
+# is listed if it reduces it by more than this fraction of the best one's, and of what fields absorb
 SIGNIFICANT, COMPARABLE = 15.0, 0.5
 # mistakes are indistinguishable for these antennas if their chi^2 differ by less, relative
 SAME = 1e-5
@@ -582,7 +582,9 @@ def _tried(judge: UnderAnySky, residuals: Residuals, unused: float = 0.0) -> Dia
             others += (last := list(absorbing))
             suffice = [one for one in last if one.suffices(base)]
     listed = suffice or ([] if fits else nearly)
-    most = max((one.gained(base) for one in listed), default=0.0)
+    # in data that fit, what unknown errors of the fields explain
+    absorbed = fits * (base.chi2 - base.degrees + unused) / 2.0**0.5
+    most = max((absorbed, *(one.gained(base) for one in listed)))
     better = [one for one in listed if one.gained(base) > COMPARABLE * most]
     better = [replace(one, chi2=one.chi2.allowing(unused)) for one in better]
     better = sorted(better, key=lambda one: (-one.chi2.p, one.chi2.chi2))

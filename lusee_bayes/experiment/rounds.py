@@ -67,8 +67,8 @@ NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
 # number of noise draws, always the same, that estimate the volume of skies that fit, the standard
 # errors that the slope must exceed, and the largest modes x unknowns for the exact one
 VOLUME_DRAWS, VOLUME_DOUBT, EXACT_VOLUME = 8, 3.0, 1500
-# if field errors are larger than expected by this factor, this is said, and mistakes are tried
-LARGE = 3.0
+# if field errors are larger than expected by these factors, mistakes are tried, and this is said
+LARGER, LARGE = 1.25, 3.0
 # relative rms by which the visibilities may be off around which drifts of the gains are inferred
 SAME_VISIBILITIES = 0.1
 # steps that oscillate are halved, down to this fraction of the full step

@@ -23,7 +23,7 @@ from lusee_bayes.core.linalg import mirrored, scaled, solve_lower
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, doubts, infer, posterior_draws, rounds_of
-from lusee_bayes.experiment.rounds import LARGE, Inference
+from lusee_bayes.experiment.rounds import LARGER, Inference
 from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
 from lusee_bayes.experiment.validity import about_sky_above, reach
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
@@ -252,7 +252,7 @@ class Conditioned:
             Test groups of data and try the usual mistakes even if the data fit.
         """
         experiment, inference, stages = self.experiment, self.from_data, stages or Stages()
-        thorough = thorough or inference.size_of_fields > LARGE
+        thorough = thorough or inference.size_of_fields > LARGER
         scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
         fluxes, pointing, diagnosis, left, judged = None, None, None, None, None
         judge, unused = self.judged.solution, inference.unused()
