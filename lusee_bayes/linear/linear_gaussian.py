@@ -544,7 +544,12 @@ class InMap(Whitened):
     def _factorised(model):
         factor = model.noise.factor()
         whitened = factor.whiten(model.coupling.dense())
-        return factor, whitened, _root(model.prior.sandwich(gram_matrix(whitened))), None
+        return (
+            factor,
+            whitened,
+            root_of_precision(model.prior.sandwich(gram_matrix(whitened))),
+            None,
+        )
 
     def seen(self, u):
         return self.whitened @ self.model.prior.colour(u)
@@ -559,13 +564,14 @@ class InData(Whitened):
         factor = model.noise.factor()
         whitened = factor.whiten(model.prior.colour_columns(model.coupling.dense()))
         basis, triangle = jnp.linalg.qr(jax.lax.stop_gradient(whitened).T)
-        return factor, whitened, _root(triangle @ triangle.T), basis
+        return factor, whitened, root_of_precision(triangle @ triangle.T), basis
 
     def _log_det(self):
         return _log_det_in_span(self.whitened, jax.lax.stop_gradient(self.lower))
 
 
-def _root(normal: Array) -> Array:
+def root_of_precision(normal: Array) -> Array:
+    """Lower L of L L^T = 1 + G^T (A^T N^-1 A) G, in JAX; NaN if there is none."""
     return jax.lax.linalg.cholesky(normal + jnp.eye(len(normal)), symmetrize_input=False)
 
 

@@ -40,13 +40,14 @@ from lusee_bayes.runs.cost import demand_of, measured_experiment
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.sampling import programs
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree
-from lusee_bayes.sampling.distributions import TimesStudentT
+from lusee_bayes.sampling.distributions import Marginal, TimesStudentT
 from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
 from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program
 from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel, site_in
 from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
+from lusee_bayes.sky.spectral_prior import SpectralPrior
 from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.registered import present
 from lusee_bayes.systematics.systematic import SKY, Chart, Systematic, Unknown
@@ -61,6 +62,7 @@ def sample_together(
     sampler: Sampler,
     folder: Path,
     *,
+    skies: SpectralPrior | None = None,
     resume: bool = False,
     stages: Stages | None = None,
 ) -> tuple[SampleResult, ...]:
@@ -76,6 +78,8 @@ def sample_together(
     sampler : Sampler
     folder : Path
         Folder of the run, including unfinished chains.
+    skies : SpectralPrior, optional
+        Over the skies of all channels, for their joint posterior.
     resume : bool
         Continue an unfinished run with the same settings, or read a finished one.
     stages : Stages, optional
@@ -85,7 +89,8 @@ def sample_together(
     ------
     InputError
         If ``folder`` has an unfinished run and ``resume`` is not given, if the unfinished run has
-        other settings, or if the program does not end with draws of the sky.
+        other settings, if the program does not end with draws of the sky, or if it does not
+        integrate out skies with a joint prior.
     """
     stages = stages or Stages()
     with stages("posterior"):
@@ -98,6 +103,7 @@ def sample_together(
         "program text": program.digest,
         **{f"sampler's {name}": value for name, value in sampler.identity().items()},
         "versions": versions(with_commit=False),
+        **({} if skies is None else {"skies": "joint"}),
     }
     if resume and not (folder / CHAINS).exists():
         trees = [_finished(folder / name / SAMPLES, identity, sampler) for name in experiments]
@@ -110,20 +116,26 @@ def sample_together(
         arguments[name] = program.arguments(inference.model, program_pieces(one))
         n_modes = len(inference.posterior.mean)
         latent[name] = programs.require_sampleable(program, arguments[name], one.data.data, n_modes)
+        observing = {**arguments[name], programs.DATA: one.data.data}
+        if skies is not None and not programs.predicts(program.model, observing, Marginal):
+            raise InputError(
+                f"the program '{program.path or program.name}' does not integrate skies out, as a "
+                "joint posterior requires: observe 'data' with lb.Marginal(gaussian), and return "
+                "gaussian; if nothing else is unknown, lusee-bayes map --joint --draws N is exact"
+            )
     data = {name: one.data.data for name, one in experiments.items()}
     first = next(iter(experiments))
     frequencies = {name: one.scenario.frequency_mhz for name, one in experiments.items()}
     octaves = sampled_together(experiments[first])
     if several:
-        model = SharedSites(program.model, frequencies, octaves)
+        model = SharedSites(program.model, frequencies, octaves, skies)
         observed = {"channels": arguments, "data": data}
     else:
         model, observed = program.model, {**arguments[first], "data": data[first]}
     whitening = None
     with stages("coordinates"):
         rounds = amplitudes_of_rounds(inferences, latent)
-        if rounds is not None:
-            sampler = replace_fields(sampler, algorithm=sampler.algorithm or "crank-nicolson")
+        if rounds is not None and skies is None:
             sites = programs.latent_sites(model, observed)
             whitening = gaussian_of_sites(*rounds, frequencies, octaves, sites)
         elif not several:
@@ -135,6 +147,8 @@ def sample_together(
             fixed = [site_in(name, n) for name in latent for n in SCALES]
             mode = laplace_approximation(model, observed, start, fixed)
             whitening = mode.whitening if bool(mode.converged) else None
+        if rounds is not None and whitening is not None:
+            sampler = replace_fields(sampler, algorithm=sampler.algorithm or "crank-nicolson")
     checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
     times = []
     with stages.progress("sampling", sampler.warmup + sampler.draws) as update:
@@ -145,6 +159,11 @@ def sample_together(
 
         with naming(f"the program '{program.path or program.name}'"):
             chains = sample(model, observed, sampler, whitening, checkpoints, report)
+    if skies is not None:
+        with stages("skies"):
+            drawn = model.drawn_skies(**observed, chains=chains, seed=sampler.seed)
+            sites = chains.sites | {site_in(name, SKY): drawn[name] for name in drawn}
+            chains = replace_fields(chains, sites=sites)
     speed, results = _speed(times, chains, sampler.warmup), []
     for name, one in experiments.items():
         with stages("data tree"):
@@ -272,8 +291,8 @@ def run_sample(
 ) -> RunOutcome[tuple[SampleResult, ...]]:
     """Sample the posterior of a program, and write the folder in one transaction.
 
-    Several frequencies are sampled one after the other, or together if they share sampled unknowns.
-    Each has its own folder, and their maps are combined into cubes.
+    Several frequencies are sampled one after the other, or together if they share sampled unknowns
+    or have a joint prior. Each has its own folder, and their maps are combined into cubes.
 
     Parameters
     ----------
@@ -294,15 +313,15 @@ def run_sample(
     Raises
     ------
     InputError
-        For a joint scenario, for an unfinished run in the folder unless ``resume``, and if
+        For positive skies, for an unfinished run in the folder unless ``resume``, and if
         scenario, program, data or folder are invalid.
     """
     scenario = load_scenario(scenario)
     scenario = scenario if data is None else scenario.of_measured()
-    if scenario.joint:
+    if scenario.joint and scenario.spectral.model == "positive":
         raise InputError(
-            "lusee-bayes sample samples one channel at a time; for the joint posterior, which is "
-            "Gaussian, use lusee-bayes map --joint --draws N for exact draws"
+            "lusee-bayes sample integrates skies out, which is not possible for positive ones; use "
+            "spectral.model=components, or lusee-bayes map --joint"
         )
     program = program or default_program(scenario)
     sampler = sampler or Sampler(seed=scenario.seed)
@@ -316,7 +335,12 @@ def run_sample(
             name: measured_experiment(channel, data, stages, n_draws=sampler.chains * sampler.draws)
             for name, channel in channels.items()
         }
-        return sample_together(experiments, program, sampler, folder, resume=resume, stages=stages)
+        skies = None
+        if scenario.joint and len(channels) > 1:
+            of_model = np.array([one.setup.sky.modes for one in experiments.values()])
+            skies = scenario.spectral.prior(np.array(scenario.frequencies_mhz), of_model)
+        more = {"skies": skies, "resume": resume, "stages": stages}
+        return sample_together(experiments, program, sampler, folder, **more)
 
     def one(
         channel: Scenario, folder: Path, stages: Stages, drawn: SampleResult | None = None
@@ -332,7 +356,9 @@ def run_sample(
         return replace_fields(made, result=(made.result,))
     channels = {f"{one.frequency_mhz:.15g}MHz": one for one in scenario.channels()}
     treated = present(scenario)
-    together = any(k.octaves(one) for k, one in treated if k.treatment(scenario) == "sampled")
+    together = scenario.joint or any(
+        k.octaves(one) for k, one in treated if k.treatment(scenario) == "sampled"
+    )
     with run_folder(folder, CUBES, scenario, data, program.path, **given) as run:
         drawn = draw(channels, run.path, stages) if together else [None] * len(channels)
         runs = []

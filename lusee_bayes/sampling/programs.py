@@ -206,10 +206,11 @@ def is_collapsed(program: Program, arguments: dict[str, Any], data: Array) -> bo
     return isinstance(traced(program.model, {**arguments, DATA: data})[1], LinearGaussian)
 
 
-def predicts(program: Callable, arguments: dict, kind: type[Prediction] = Prediction) -> bool:
-    """Return whether a program has a site CorrelatedNormal or TimesStudentT, or of one ``kind``.
+def predicts(program: Callable, arguments: dict, kind: type = Prediction) -> bool:
+    """Return whether a program has a site of a kind of distribution.
 
-    It then samples everything that they depend on, and its density needs only matrix products.
+    With CorrelatedNormal or TimesStudentT (Predictions), it samples everything that they depend on,
+    and its density needs only matrix products.
     """
     sites = traced(program, arguments)[0].values()
     return any(site["type"] == "sample" and isinstance(site["fn"], kind) for site in sites)

@@ -8,6 +8,9 @@ of earlier channels, a later channel has ::
 
 where K is the covariance of the earlier z, and k their covariance with the new one. If that
 variance vanishes, as for values common to all channels, the channel has the mean instead of a site.
+
+Skies of a joint posterior are integrated out together (:mod:`.joint_model`): the channels' own
+evidences are left out, and one of all data takes their place.
 """
 
 from __future__ import annotations
@@ -19,16 +22,24 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
 from numpyro import distributions as dist
+from numpyro.infer import Predictive
 from numpyro.primitives import Messenger
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.linear.amplitudes import Amplitudes, kernel, tie
+from lusee_bayes.linear.joint_model import JointModel
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.sampling.hmc import Chains, Whitening
+from lusee_bayes.sampling.programs import DATA, numpyro_promotion
+from lusee_bayes.sky.spectral_prior import SpectralPrior
 from lusee_bayes.systematics.systematic import Unknown
 
 # variances below this (1e-5 of a standard deviation) are rounding of K
 NOTHING_LEFT = 1e-10
+# number to fold into the seed for joint draws of skies
+OF_SKIES = 2
 
 
 def site_in(channel: str, name: str) -> str:
@@ -99,11 +110,15 @@ class SharedSites:
         By channel.
     octaves : dict of float
         Over which channels share a site, by name (:meth:`.Systematic.octaves`).
+    skies : SpectralPrior or None
+        Over the skies of all channels, which the program has to integrate out; None if channels
+        have independent skies.
     """
 
     program: Callable
     frequencies_mhz: Mapping[str, float]
     octaves: Mapping[str, float]
+    skies: SpectralPrior | None = None
 
     def __call__(self, channels: Mapping[str, dict], data: Mapping[str, Array]):
         """Sample all channels given their data; return the program's result for each."""
@@ -112,7 +127,27 @@ class SharedSites:
         for channel, arguments in channels.items():
             with _Channel(self, channel, site_values):
                 returned.append(self.program(**arguments, data=data[channel]))
+        if self.skies is not None:
+            numpyro.factor("evidence", self.together(returned, data).log_prob())
         return returned
+
+    def together(self, models: Sequence[LinearGaussian], data: Mapping[str, Array]) -> JointModel:
+        """Combine the channels' models, as the program returns them."""
+        return JointModel.of(models, list(data.values()), self.skies)
+
+    @numpyro_promotion()
+    def drawn_skies(
+        self, channels: Mapping[str, dict], data: Mapping[str, Array], chains: Chains, seed: int
+    ) -> dict[str, np.ndarray]:
+        """Draw every channel's sky given each draw of its sites, (chains, draws, modes), in K."""
+
+        def model():
+            joint = self.together(self(channels, data), data)
+            numpyro.deterministic("skies", joint.sample(numpyro.prng_key()))
+
+        key = jax.random.fold_in(jax.random.key(seed), OF_SKIES)
+        draw = Predictive(model, chains.sites, batch_ndims=2, return_sites=["skies"])
+        return dict(zip(channels, np.moveaxis(np.asarray(draw(key)["skies"]), 2, 0), strict=True))
 
 
 class _Channel(Messenger):
@@ -133,6 +168,9 @@ class _Channel(Messenger):
             return
         name, prior = msg["name"], msg["fn"]
         msg["name"] = site_in(self.channel, name)
+        if name == DATA and self.shared.skies is not None:
+            msg["stop"] = True
+            return
         if msg["type"] != "sample" or name not in self.shared.octaves:
             return
         octaves, before = self.shared.octaves[name], self.site_values.setdefault(name, {})

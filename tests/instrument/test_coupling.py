@@ -16,6 +16,7 @@ from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, Instrument
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout, auto_indices, labels
+from lusee_bayes.linear.joint_model import ChannelCouplings
 from lusee_bayes.systematics.beam import BeamError, InstrumentParameters
 from lusee_bayes.systematics.systematic import Unknown
 from lusee_bayes.testing import check_coupling
@@ -85,7 +86,16 @@ def given(n_data, n_unknowns):
     return DenseCoupling(matrix), matrix
 
 
+def channels():
+    """Two channels with three maps, of which the last is only in the second."""
+    parts, mixing = [given(n, 4)[1] for n in (9, 3)], np.array([[1.0, 0.5, 0.0], [2.0, -1.0, 1.0]])
+    made = ChannelCouplings(tuple(map(jnp.asarray, parts)), jnp.asarray(mixing))
+    written = [np.kron(row, part) for row, part in zip(mixing[:, None], parts, strict=True)]
+    return made, np.concatenate(written)
+
+
 KINDS = {"structured": flagged, "dense": lambda: given(9, 16), "tall": lambda: given(30, 5)}
+KINDS["channels"] = channels
 
 
 @pytest.mark.parametrize("made", KINDS.values(), ids=list(KINDS))

@@ -1,5 +1,7 @@
 """One posterior for several frequencies, against all data and skies as one big Gaussian."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from scipy.linalg import block_diag
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.linear import joint
+from lusee_bayes.linear.joint_model import JointModel
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 FREQUENCIES = np.array([10.0, 17.0, 25.0, 40.0])
@@ -98,20 +101,20 @@ EVERY = [
 
 @pytest.fixture(scope="module", params=EVERY)
 def case(request):
-    """Prior, models, data, what they tell, and the textbook's answer."""
+    """Prior, models and data, what they tell, and the textbook's answer."""
     prior = PRIORS[request.param]()
     made = models(prior)
     data = drawn(prior, made)
     a, n = big_gaussian(made)
     answer = posterior(a, covariance_of(prior), np.diag(n), np.concatenate(data))
-    return prior, *information_from(made, data), answer
+    return prior, (made, data), *information_from(made, data), answer
 
 
 @pytest.mark.essential
 @pytest.mark.parametrize("place", [on_host, on_device])
 def test_the_direct_solution_is_the_textbooks(case, place):
     """Of NumPy's arrays and of JAX's."""
-    prior, channels, reference, (mean, covariance, evidence) = case
+    prior, _, channels, reference, (mean, covariance, evidence) = case
     found = solve_directly(place(prior), channels, reference)
     np.testing.assert_allclose(found.log_evidence, evidence, rtol=1e-8)
     std = np.sqrt(np.diag(covariance)).reshape(-1, N_MODES)
@@ -131,6 +134,30 @@ def test_the_direct_solution_is_the_textbooks(case, place):
     seen = np.concatenate(slopes) @ np.asarray(found.root())
     others = np.kron(1.0 - np.eye(len(channels)), np.ones((N_MODES, N_MODES)))
     within(others * (seen @ seen.T), others * covariance, 1e-7 * std.max() ** 2)
+
+
+@pytest.mark.essential
+def test_channels_in_one_model_are_the_textbooks(case):
+    """Evidence, its slope with the gain of one channel, and draws of all skies together."""
+    prior, (made, data), *_, (mean, covariance, evidence) = case
+
+    def with_gain(gain):
+        scaled = [replace(made[0], coupling=made[0].coupling.dense() * gain)]
+        return JointModel.of([*scaled, *made[1:]], [jnp.asarray(one) for one in data], prior)
+
+    value, slope = jax.value_and_grad(lambda gain: with_gain(gain).log_prob())(1.0)
+    np.testing.assert_allclose(value, evidence, rtol=1e-8)
+    a, n = big_gaussian(made)
+    rows, step = (np.arange(len(a)) < len(data[0]))[:, None], 1e-4
+    moved = [a * (1.0 + sign * step * rows) for sign in (1.0, -1.0)]
+    rest = covariance_of(prior), np.diag(n), np.concatenate(data)
+    up, down = (posterior(matrix, *rest)[2] for matrix in moved)
+    np.testing.assert_allclose(slope, (up - down) / (2.0 * step), rtol=1e-5)
+    keys, variances = jax.random.split(jax.random.key(3), 4000), np.diag(covariance)
+    off = np.asarray(jax.vmap(with_gain(1.0).sample)(keys)).reshape(4000, -1) - mean
+    assert (np.abs(off.mean(0)) < z_of(len(mean)) * np.sqrt(variances / 4000)).all()
+    scatter = np.sqrt((np.outer(variances, variances) + covariance**2) / 4000)
+    assert (np.abs(off.T @ off / 4000 - covariance) < z_of(covariance.size) * scatter).all()
 
 
 def test_skies_that_do_not_obey_the_prior_are_told():

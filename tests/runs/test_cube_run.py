@@ -23,6 +23,7 @@ from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs.channels import map_channels
 from lusee_bayes.sampling.datatree import read_datatree
+from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sky.sky_source import SkyCube
 from lusee_bayes.systematics.context import Around
 
@@ -235,8 +236,38 @@ def test_sampling_several_channels(tmp_path, capsys):
     before = read_datatree(samples)["posterior"]["sky"].values
     assert run(*command, "--resume") == 0
     np.testing.assert_array_equal(read_datatree(samples)["posterior"]["sky"].values, before)
-    joint = ("--set", "joint=true", "--set", "spectral.components=[power_law]")
-    assert "samples one channel at a time" in refused(capsys, *command, *joint)
+    joint = (tmp_path / "joint", "--set", "joint=true", "--set", "spectral.components=[power_law]")
+    assert "sky.py' does not integrate skies out" in refused(capsys, *command[:-1], *joint)
+    refuse("not possible for positive", lb.run_sample, three(*POSITIVE), tmp_path / "positive")
+
+
+@pytest.mark.long
+def test_sampled_unknowns_beside_joint_skies_are_those_of_the_map(tmp_path):
+    """Receivers are linear: draws have mean and width of the joint Gaussian. Noise is so strong
+    that each channel learns from the others."""
+    common = "noise.receiver={power_k: 2000, relative_std: 0.2, smooth_octaves: 1.0}"
+    noisy = common, "noise.radiometer.factor=1e4", "joint=true", "lmax=3"
+    scenario = three(*noisy, "spectral.components=[power_law]")
+    lb.run_map(scenario, tmp_path / "map")
+    sampled = three(*noisy, "spectral.components=[power_law]", "noise.receiver.treatment=sampled")
+    sampler = Sampler(chains=4, draws=500, warmup=200, seed=1)
+    drawn = lb.run_sample(sampled, tmp_path / "draws", sampler=sampler).result
+    found, table = posterior_of(tmp_path / "map"), table_of(tmp_path / "map" / "unknowns.csv")
+    alone = drawn[0].tree["constant_data"]["analytic_std"].values
+    assert (alone / found["std"][0]).mean() > 1.3
+    for number, result in enumerate(drawn):
+        assert result.summary["r_hat"].max() < 1.02
+        mhz, sites = result.experiment.scenario.frequency_mhz, result.tree["posterior"]
+        here = [row for row in table if float(row["frequency_mhz"]) == mhz]
+        mean = [*found["mean"][number], *(float(row["value"]) for row in here)]
+        std = np.array([*found["std"][number], *(float(row["std"]) for row in here)])
+        values = [
+            *result.skies.reshape(2000, -1).T,
+            *(sites[r["unknown"]].values.ravel() for r in here),
+        ]
+        # some 1,000 independent draws: four and a half standard deviations
+        assert np.abs((np.mean(values, 1) - mean) / std).max() < 0.15
+        assert np.abs(np.std(values, 1) / std - 1.0).max() < 0.1
 
 
 POSITIVE = [
