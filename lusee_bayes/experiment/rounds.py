@@ -546,6 +546,8 @@ def prediction(setup: Setup, inference: Inference, solved: DataVector) -> Grid:
 
 # largest factor of N under which the sky above lmax is learned
 MOST_RAISED = 10.0
+# a learned sky above lmax is not used if it makes ln p(d) lower by more than this
+LEAST_WORSE = 5.0
 # a larger problem first learns its parameters up to this ell, in a tenth of the time
 COARSE_LMAX = 24
 
@@ -599,7 +601,7 @@ def with_learned_prior(
             else:
                 first = setup.family.start_from(coarse, learned.parameters)
             covariance = averaged_beyond(family, coarse, learned.scores)
-            setup = _levelled(with_sky_above(setup, covariance, start.values), covariance, start)
+            setup = _with_learned_sky_above(setup, covariance, start)
     result = settled(setup, start, learn, report)
     if surveys:
         learned = _compared_surveys(setup, whole(result.solution.information), result.learned)
@@ -607,15 +609,26 @@ def with_learned_prior(
     return replace(setup, prior=result.learned.prior), result
 
 
-def _levelled(setup: Setup, covariance: ModesMatrix, around: Around) -> Setup:
-    """Scale the expected sky above lmax to the level that the data themselves suggest."""
-    n, above = setup.prior.size, setup.above
+def _with_learned_sky_above(setup: Setup, covariance: ModesMatrix, around: Around) -> Setup:
+    """Set the expected sky above lmax, at the level that the data themselves suggest.
+
+    It stays as it was if the data are less probable with the learned one: what scales above lmax
+    need not follow from those below.
+    """
+    n = setup.prior.size
     prior = setup.family.prior(covariance[:n, :n])
-    found = _conditioned(replace(setup, prior=prior), around, 1, None)
+
+    def under(setup: Setup) -> Inference:
+        return _conditioned(replace(setup, prior=prior), around, 1, None)
+
+    new = with_sky_above(setup, covariance, around.values)
+    found = under(new)
     (term,) = (s.systematic for s in found.systematics if isinstance(s.systematic, AboveLmax))
     level = variance_factor(template_amplitudes(found.solution, term.root), LOG_LEVEL_STD)
-    above = replace(above, root=above.root * np.sqrt(level), power=above.power * level)
-    return replace(setup, above=above)
+    root, power = new.above.root * np.sqrt(level), new.above.power * level
+    new = replace(new, above=replace(new.above, root=root, power=power))
+    before, after = (float(under(one).posterior.log_evidence) for one in (setup, new))
+    return new if after > before - LEAST_WORSE else setup
 
 
 def _compared_surveys(setup: Setup, information: Information, learned: Learned) -> Learned:

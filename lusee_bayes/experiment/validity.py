@@ -277,13 +277,14 @@ def reach(experiment: Experiment, inference: Inference) -> list[str]:
     """
     sentences, setup = [], experiment.setup
     k, moved_by = weighed(setup, np.asarray(experiment.data.data), inference) or (0.0, 0.0)
-    if k > LARGEST_K:
+    if k > LARGEST_K or moved_by >= LARGEST_MOVE:
         keys = ", ".join(dict.fromkeys(part.systematic.key for part in inference.moving))
         holds = "its errors are valid" if moved_by < LARGEST_MOVE else "its errors are not valid"
         sentences.append(
-            f"The posterior of {keys} is not Gaussian (Pareto k = {k:.2g}, accepted: "
-            f"{LARGEST_K:g}). Terms beyond first order move the map by {moved_by:.2g} of its "
-            f"standard deviations (rms), so that {holds}; treatment=sampled needs no Gaussian."
+            f"The posterior of {keys} is not Gaussian: terms beyond first order move the map by "
+            f"{moved_by:.2g} of its standard deviations (rms; accepted: {LARGEST_MOVE:g}), and the "
+            f"weights of draws have Pareto k = {k:.2g} (accepted: {LARGEST_K:g}). Thus {holds}; "
+            "treatment=sampled needs no Gaussian."
         )
     if setup.measured:
         spots = blind_spots(setup, inference, inference.posterior.mean)

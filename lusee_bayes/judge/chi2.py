@@ -75,6 +75,10 @@ class ChiSquare:
         # both are one half at the median, up to rounding
         return float(np.minimum(1.0, 2.0 * np.minimum(*tails)))
 
+    def p_of_prior(self, learned: bool) -> float:
+        """p-value of a prior's chi^2: one-sided if the prior was fitted to the same data."""
+        return float(special.chdtrc(self.degrees, self.chi2)) if learned else self.p
+
     @property
     def fits(self) -> bool:
         """Whether chance explains it, as a single test."""

@@ -84,6 +84,8 @@ class ChannelFits:
         Whether channels share a posterior.
     shared : tuple of SharedTest
         If they share the instrument.
+    learned : bool
+        Whether priors were learned from these data.
     """
 
     frequencies_mhz: Float[np.ndarray, " channels"]
@@ -91,6 +93,7 @@ class ChannelFits:
     prior: ChiSquare
     joint: bool = False
     shared: tuple[SharedTest, ...] = ()
+    learned: bool = False
 
     @property
     def total(self) -> ChiSquare:
@@ -113,12 +116,13 @@ class ChannelFits:
         above = sum(bool(chdtrc(one.degrees, one.chi2) < 0.5) for one in self.channels)
         signs = min(1.0, 2.0 * float(bdtr(min(above, n - above), n, 0.5)))
         name = "prior" if self.joint else "prior, mean over channels"
+        of_prior = self.prior.p_of_prior(self.learned)
         where = f"{self.frequencies_mhz[least]:g} MHz, {self.channels[least].chi2_words()}"
         return [
             JointTest("sum over all channels", self.total.p, 1, self.total.chi2_words()),
             JointTest("channels above the median", signs, 1, f"{above} of {n}"),
             JointTest("most deviant channel", float(p[least]), n, where),
-            JointTest(name, self.prior.p, 1, self.prior.chi2_words(), of_prior=True),
+            JointTest(name, of_prior, 1, self.prior.chi2_words(), of_prior=True),
         ]
 
     def fit(self) -> Fit:

@@ -528,7 +528,11 @@ def roots(weights: Weights, chosen: CellFlags) -> Roots:
     if weights.ndim == 2:
         return np.where(some, np.sqrt(within), 1.0)
     both = some[:, :, None] & some[:, None]
-    return np.linalg.cholesky(np.where(both, within[..., used], np.eye(len(used))))
+    blocks = np.where(both, within[..., used], np.eye(len(used)))
+    try:
+        return np.linalg.cholesky(blocks)
+    except np.linalg.LinAlgError:  # NaN where there is none
+        return linalg.cholesky(blocks)
 
 
 def solve_roots(root: Roots, x: np.ndarray, *, transpose: bool = False) -> np.ndarray:

@@ -82,11 +82,14 @@ class Residuals:
     groups : tuple of Group
         The data of every product, day and turntable angle; none if they are not judged because
         the test would need too large an A (:meth:`.LeftOut.of`).
+    learned : bool
+        Whether the prior was learned from these data: its chi^2 may then be small.
     """
 
     z: DataVector
     split: Split
     groups: tuple[Group, ...]
+    learned: bool = False
 
     def compared(self) -> list[Group]:
         """Groups that other data predict."""
@@ -110,7 +113,8 @@ class Residuals:
         """
         if self.extremes() or stands_out(self.split.instrument.p, self.n_tests):
             return "does not fit"
-        return "unlike the prior" if stands_out(self.split.prior.p, self.n_tests) else "consistent"
+        p = self.split.prior.p_of_prior(self.learned)
+        return "unlike the prior" if stands_out(p, self.n_tests) else "consistent"
 
     def suspects(self) -> list[Group]:
         """Find the groups without which the rest fits.
@@ -180,7 +184,9 @@ class Residuals:
         return parts
 
 
-def residuals(solution: Solution, data: Visibilities, unused: float = 0.0) -> Residuals:
+def residuals(
+    solution: Solution, data: Visibilities, unused: float = 0.0, *, learned: bool = False
+) -> Residuals:
     """Compare data with the model's predictions for them, group by group.
 
     Days have 24 hours from the first sample. Runs at the same turntable angle are one group.
@@ -193,6 +199,8 @@ def residuals(solution: Solution, data: Visibilities, unused: float = 0.0) -> Re
         In K, with their times and turntable angles.
     unused : float
         Degrees of freedom that unknowns may leave unused (:meth:`.ChiSquare.allowing`).
+    learned : bool
+        Whether the prior was learned from these data.
 
     Returns
     -------
@@ -209,7 +217,7 @@ def residuals(solution: Solution, data: Visibilities, unused: float = 0.0) -> Re
     split = replace(split, instrument=split.instrument.allowing(unused))
     left_out = LeftOut.of(replace(model, prior=split.wide.prior), data, split.wide)
     if left_out is None:
-        return Residuals(np.full(model.n_data, np.nan), split, ())
+        return Residuals(np.full(model.n_data, np.nan), split, (), learned)
     whole = split.instrument
 
     def judged(group: DataGroup, missed: Missed) -> Group:
@@ -224,4 +232,4 @@ def residuals(solution: Solution, data: Visibilities, unused: float = 0.0) -> Re
     groups = groups_of(data)
     tests = tuple(map(judged, groups, left_out.each([group.data for group in groups])))
     z = layout.gather(left_out.u) / np.sqrt(layout.gather(left_out.inverse_diagonal))
-    return Residuals(z, split, tests)
+    return Residuals(z, split, tests, learned)

@@ -46,6 +46,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from numpy.random import Generator
+from scipy.special import logsumexp
 
 from lusee_bayes.core.arrays import Draws, ModesMatrix, Square
 from lusee_bayes.core.engine import in_threads
@@ -140,8 +141,10 @@ INFINITE = "the mean of a variance over the prior's uncertain parameters is infi
 # shifts of ln C at which the evidence of the averaged prior is computed, to find the best one
 LEVELS = (-1.0, -0.5, 0.0)
 # a level whose standard deviation, given the other parameters, exceeds MEASURED is only limited by
-# the data, and FIXED: the mean of its exponential would be far above that limit
+# the data, and FIXED at the mean of its exponential over the shifts LIMITED from the most probable
+# level: over a normal distribution, that mean would be far above the limit
 MEASURED, FIXED = 1.0, 1e-3
+LIMITED = np.arange(-3.0, 12.0)
 # how often a fixed prior is widened tenfold if rounding prevents a posterior mean
 MOST_WIDENINGS = 4
 
@@ -381,24 +384,36 @@ def _learned(
     evidence = float(point.posterior.log_evidence) + scores.log_gain
     first = np.arange(len(covariance)) == 0
     mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
-    if np.linalg.inv(about)[0, 0] < MEASURED**-2:
+    limited = np.linalg.inv(about)[0, 0] < MEASURED**-2
+    if limited:
         others = np.where(np.logical_or.outer(first, first), 0.0, scores.covariance)
         scores = replace(scores, covariance=others + FIXED**2 * np.diag(first))
         mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
 
     # S is a constant plus a part proportional to the level
-    with np.errstate(over="raise"), refusing(INFINITE, FloatingPointError):
-        once, twice = (family.averaged(mean + level * first, about) for level in (0.0, np.log(2.0)))
-
     def at_level(shift: float) -> Posterior:
         return information.posterior(family.prior(once + np.expm1(shift) * (twice - once)))
 
-    tried = [float(at_level(shift).log_evidence) for shift in LEVELS]
-    square, linear, _ = np.polyfit(LEVELS, tried, 2)
-    shift = -0.5 * linear / square if square < 0 else LEVELS[int(np.argmax(tried))]
-    shift = float(np.clip(shift, LEVELS[0] - 1.0, LEVELS[-1] + 1.0))
+    try:
+        with np.errstate(over="raise"), refusing(INFINITE, FloatingPointError):
+            two = (family.averaged(mean + level * first, about) for level in (0.0, np.log(2.0)))
+            once, twice = two
+        tried = [float(at_level(shift).log_evidence) for shift in (LIMITED if limited else LEVELS)]
+        if limited:
+            of_prior = [family.hyperprior.log_density(mean + by * first) for by in LIMITED]
+            log_p = np.add(tried, of_prior)
+            shift = float(logsumexp(log_p + LIMITED) - logsumexp(log_p))
+        else:
+            square, linear, _ = np.polyfit(LEVELS, tried, 2)
+            shift = -0.5 * linear / square if square < 0 else LEVELS[int(np.argmax(tried))]
+            shift = float(np.clip(shift, LEVELS[0] - 1.0, LEVELS[-1] + 1.0))
+        prior = at_level(shift).prior
+    except InputError:  # too uncertain to be averaged: the most probable values
+        prior, still = point.posterior.prior, FIXED**2 * np.eye(len(mean))
+        scores = Scores(family.hyperprior.scores(point.parameters), still, scores.log_gain)
+        return Learned(prior, point.parameters, covariance, scores, evidence)
     moved = shift * first / family.hyperprior.slopes_of_scores(scores.mean)[0]
-    prior, scores = at_level(shift).prior, replace(scores, mean=scores.mean + moved)
+    scores = replace(scores, mean=scores.mean + moved)
     return Learned(prior, point.parameters, covariance, scores, evidence)
 
 

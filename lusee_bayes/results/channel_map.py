@@ -265,7 +265,7 @@ class Conditioned:
                 instrument = Split.of(*given, None if joint else self.expected).instrument
                 instrument = instrument.allowing(unused)
             if alone or thorough or instrument.p < DOUBTFUL:
-                left = residuals(judge, data, unused)
+                left = residuals(judge, data, unused, learned=learned is not None)
                 instrument = left.split.instrument
             details = _details(self) if alone else None
         bad = left is not None and left.level() == "does not fit"

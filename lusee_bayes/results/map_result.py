@@ -184,7 +184,8 @@ class MapResult(Described):
         # one sky in all channels: their parts may be as good as the same, and a mean is no surer
         n = 1 if joint else len(parts)
         prior = ChiSquare(chi2 / n, degrees / n)
-        return ChannelFits(self.frequencies_mhz, parts, prior, joint, self.shared_tests)
+        learned = any(c.log_evidence_learned is not None for c in self.channels)
+        return ChannelFits(self.frequencies_mhz, parts, prior, joint, self.shared_tests, learned)
 
     @cached_property
     def fit(self) -> Fit:

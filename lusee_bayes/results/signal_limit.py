@@ -6,7 +6,9 @@ The spectrum y of a region, with the posterior covariance V of all frequencies
     y(f) = exp(sum_k c_k T_k(x)) + a t(f),    x = ln f scaled to -1 ... 1,
 
 a smooth sky, a polynomial of ln f, plus a template t of the amplitude a. T_k are Chebyshev
-polynomials; c and a have flat priors. Sky, gains, receivers and ground are in V.
+polynomials; c and a have flat priors. Sky, gains, receivers and ground are in V. A sky that needs
+one more term can look like the template, which chi^2 does not show: given enough frequencies, the
+change of a with that term is part of its error.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from lusee_bayes.results.sky_spectrum import OBSERVED, Frequencies, SkySpectrum
 ORDER, SETTLED, FAINT = 6, 1e-12, 1e-6
 # standard deviations of a detection, and the probability below the limit
 DETECTED, LEVEL = 5.0, 0.95
+TERM = "the next term of the polynomial"
 TABLE = Layout(
     "a template of a signal",
     {
@@ -51,13 +54,14 @@ class SignalLimit:
     ----------
     name, region : str
     amplitude, std : float
-        In units of the template.
+        In units of the template; the error includes the change with one more term.
     limit : float
         The magnitude of the amplitude is below it with a probability of 95 %.
     fit : ChiSquare
         Of the smooth sky and the signal.
     without : dict of float
-        Standard deviation if errors from one source (:class:`.SkySpectrum`) were absent.
+        Standard deviation if errors from one source (:class:`.SkySpectrum`, or :data:`TERM`) were
+        absent.
     """
 
     name: str
@@ -127,7 +131,7 @@ def signal_limit(
             f"at least {order + 3} are needed; lower --order"
         )
     x = np.log(f / np.sqrt(f.min() * f.max())) / np.log(np.sqrt(f.max() / f.min()))
-    smooth, t, y = chebvander(x, order), template(f), spectrum.temperature[k]
+    t, y = template(f), spectrum.temperature[k]
     if not np.isfinite(t).all() or np.abs(t).max() < FAINT:
         raise InputError(
             f"{name}: the template vanishes or is not finite at {f.min():g} to {f.max():g} MHz"
@@ -136,29 +140,37 @@ def signal_limit(
         raise InputError(f"the {region} has temperatures that are not positive")
     checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
 
-    def modelled(_: Frequencies, *values: float) -> Frequencies:
-        return np.exp(smooth @ values[:-1]) + values[-1] * t
-
-    def slopes(_: Frequencies, *values: float) -> Float[np.ndarray, "frequency columns"]:
-        return np.column_stack([np.exp(smooth @ values[:-1])[:, None] * smooth, t])
-
-    start = np.append(np.linalg.lstsq(smooth, np.log(y), rcond=None)[0], 0.0)
-    given = modelled, f, y, start, spectrum.covariance[k]
-    options = {"jac": slopes, "x_scale": "jac", "method": "trf", "full_output": True}
+    options = {"x_scale": "jac", "method": "trf", "full_output": True}
     options |= dict.fromkeys(("ftol", "xtol", "gtol"), SETTLED)
-    no_fit = f"the smooth spectrum of the {region} does not converge; lower --order"
-    with refusing(no_fit, RuntimeError):
-        values, _, found, *_ = curve_fit(*given, absolute_sigma=True, **options)
-    amplitude, off = float(values[-1]), found["fvec"]
 
-    def error_under(covariance: Square) -> float:
-        columns = slopes(f, *values)
+    def fitted(order: int) -> tuple[float, Vector, Float[np.ndarray, "frequency columns"]]:
+        """Amplitude, white residuals, and derivatives by all parameters, for a degree."""
+        smooth = chebvander(x, order)
+
+        def modelled(_: Frequencies, *values: float) -> Frequencies:
+            return np.exp(smooth @ values[:-1]) + values[-1] * t
+
+        def slopes(_: Frequencies, *values: float) -> Float[np.ndarray, "frequency columns"]:
+            return np.column_stack([np.exp(smooth @ values[:-1])[:, None] * smooth, t])
+
+        start = np.append(np.linalg.lstsq(smooth, np.log(y), rcond=None)[0], 0.0)
+        given = modelled, f, y, start, spectrum.covariance[k]
+        no_fit = f"the smooth spectrum of the {region} does not converge; lower --order"
+        with refusing(no_fit, RuntimeError):
+            values, _, found, *_ = curve_fit(*given, absolute_sigma=True, jac=slopes, **options)
+        return float(values[-1]), found["fvec"], slopes(f, *values)
+
+    amplitude, off, columns = fitted(order)
+    change = fitted(order + 1)[0] - amplitude if len(f) > order + 3 else 0.0
+
+    def error_under(covariance: Square, change: float = change) -> float:
         normal = columns.T @ np.linalg.solve(covariance, columns)
         alike = f"{name}: a smooth spectrum of degree {order} looks the same; raise --order"
         with refusing(alike, np.linalg.LinAlgError):
-            return float(np.sqrt(np.linalg.inv(normal)[-1, -1]))
+            return float(np.hypot(np.sqrt(np.linalg.inv(normal)[-1, -1]), change))
 
-    std, without = error_under(spectrum.covariance[k]), {}
+    std = error_under(spectrum.covariance[k])
+    without = {TERM: error_under(spectrum.covariance[k], 0.0)}
     for source, shares in zip(spectrum.sources, spectrum.shares[:, k], strict=True):
         if source == ALL_TOGETHER:
             continue

@@ -18,9 +18,8 @@ from lusee_bayes.core.files import require_new, transaction, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
 from lusee_bayes.experiment.data_files import Data, names_of_data, read_data, reduce_files
-from lusee_bayes.experiment.experiment import Experiment, observed
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
-from lusee_bayes.experiment.model import require_fitting, set_up
+from lusee_bayes.experiment.model import require_fitting, set_up, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.gain_model import write_gain_table
@@ -33,6 +32,7 @@ from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_wa
 from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
 from lusee_bayes.runs.folder import RunKind, inputs_of, run_folder
 from lusee_bayes.runs.plan_run import expected_inference
+from lusee_bayes.systematics.context import Setup
 
 
 def run_simulate(
@@ -81,19 +81,21 @@ def run_simulate(
         )
     channels = (scenario,) if scenario.single else scenario.channels()
     require_fits(simulation_cost(scenario, len(channels)), scenario)
-    experiments = [observed(channel, stages=stages) for channel in channels]
-    data = [experiment.data for experiment in experiments]
+    setups = [set_up(channel, stages=stages) for channel in channels]
+    with stages("noise"):
+        data = [simulate(setup) for setup in setups]
     if is_waterfall:
-        _write_waterfall(path, experiments, scenario)
+        _write_waterfall(path, data, setups, scenario)
     else:
         data[0].write(path, {"scenario": scenario.to_yaml()})
     return data
 
 
-def _write_waterfall(path: Path, experiments: Sequence[Experiment], scenario: Scenario) -> None:
+def _write_waterfall(
+    path: Path, data: Sequence[Visibilities], setups: Sequence[Setup], scenario: Scenario
+) -> None:
     """Write luseepy's four-port layout if the beams have circuits, else its scalar layout."""
-    data = [experiment.data for experiment in experiments]
-    sources = [(e.setup.beam_source, e.scenario.frequency_mhz) for e in experiments]
+    sources = [(setup.beam_source, setup.frequency_mhz) for setup in setups]
     circuits = [circuit for source, f in sources if (circuit := source.circuit(f)) is not None]
     if circuits:
         beam = scenario.beam

@@ -27,7 +27,7 @@ from lusee_bayes.instrument.beams.source import BeamSource, Receiver
 from lusee_bayes.instrument.coupling import CouplingMatrix, Instrument
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, without_gaps
+from lusee_bayes.instrument.products import DataLayout, ports, without_gaps
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.sky.prior import Prior
@@ -239,11 +239,20 @@ class Setup:
         return section.bandwidth_hz * self.observation.live_s * section.duty_cycle
 
     @property
-    def has_autos(self) -> bool:
-        """Whether every port that was used has its auto at some time."""
-        seen, n = np.asarray(self.layout.present).any(1), self.beam_source.n_ports
-        first, second, _ = ports(n)
-        return bool(seen[auto_indices(n)[np.union1d(first[seen], second[seen])]].all())
+    def noise_is_seen(self) -> bool:
+        """Whether what the noise depends on was seen at some time.
+
+        Of all ports used, it depends on the autos, and in the exact form on the crosses, too.
+        """
+        seen, (first, second, _) = (
+            np.asarray(self.layout.present).any(1),
+            ports(self.beam_source.n_ports),
+        )
+        used = np.union1d(first[seen], second[seen])
+        needed = np.isin(first, used) & np.isin(second, used)
+        if self.scenario.noise.radiometer.form != "exact":
+            needed &= first == second
+        return bool(seen[needed].all())
 
 
 def prior_and_family(scenario: Any, sky: Sky) -> tuple[Prior, PriorFamily | None]:
@@ -293,7 +302,7 @@ class Around:
 def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:
     """The visibilities around which a term of N is built, in K.
 
-    Before there is a prediction, they are the measured ones or, if autos on which noise depends
+    Before there is a prediction, they are the measured ones or, if products on which noise depends
     were never measured, the modelled sky's. Missing samples of measured ones are interpolated. A
     time without any sample gets the model's, which are not used.
 
@@ -307,7 +316,7 @@ def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:
         return setup.signal
     if about == "posterior" and around.visibilities is not None:
         return around.visibilities
-    if about == "posterior" and not setup.has_autos:
+    if about == "posterior" and not setup.noise_is_seen:
         return setup.signal
     try:
         measured = without_gaps(data.layout.scatter(data.data), data.layout)

@@ -85,7 +85,7 @@ def radiometer_about(setup: Setup) -> NoiseAbout:
     chosen = setup.scenario.noise.radiometer.temperature
     if chosen is not None or not setup.measured:
         return chosen or "model"
-    return "measured" if setup.has_autos and common_bias(setup) < HARMLESS_BIAS else "posterior"
+    return "measured" if setup.noise_is_seen and common_bias(setup) < HARMLESS_BIAS else "posterior"
 
 
 def common_bias(setup: Setup) -> float:

@@ -15,7 +15,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import averaging_rows, modes_to_map, per_mode, taper
 from lusee_bayes.report.figures.maps import spectrum_figure
 from lusee_bayes.results import sky_spectrum as sp
-from lusee_bayes.results.signal_limit import named_template, signal_limit
+from lusee_bayes.results.signal_limit import TERM, named_template, signal_limit
 from lusee_bayes.sky.prior import IndependentPrior
 
 SMALL = ["lmax=4", "observation.runs.0.cycles=0.1", "prior={model: isotropic, spectrum: sky}"]
@@ -138,8 +138,30 @@ def test_limits_on_a_signal_cover_it(injected, found):
     assert all(one.limit > 1.6 * one.std for one in limits)
     assert [one.detected for one in limits].count(not found) <= 1
     assert sum(one.fit.fits for one in limits) >= 98
-    assert limits[0].without["gains"] == pytest.approx(limits[0].std * np.sqrt(0.1), rel=1e-6)
+    own, change = (
+        limits[0].without[TERM],
+        np.sqrt(limits[0].std ** 2 - limits[0].without[TERM] ** 2),
+    )
+    expected = np.hypot(own * np.sqrt(0.1), change)
+    assert limits[0].without["gains"] == pytest.approx(expected, rel=1e-6)
     assert ("detected" if found else "without errors from gains") in limits[0].sentence()
+
+
+def test_a_sky_with_one_more_term_is_no_signal():
+    """Its polynomial is too low by a term that looks like a trough of 1.5 standard deviations."""
+    f, template = np.arange(14.0, 36.0, 3.0), named_template("trough:20:3")
+    sky = sp.cane_1979(f) * np.exp(-((4.0 / f) ** 2.1))
+    covariance = np.outer(sky, sky) * (0.7 + 0.3 * np.eye(len(f))) * 1e-6
+    exact = signal_limit(spectrum_of(f, sky, covariance), *template, order=4)
+    covariance *= (exact.amplitude / exact.without[TERM] / 1.5) ** 2
+    noise = np.random.default_rng(6).multivariate_normal(np.zeros(len(f)), covariance, size=60)
+    limits = [signal_limit(spectrum_of(f, sky + n, covariance), *template, order=4) for n in noise]
+    alone, whole = (
+        np.sqrt(np.mean([(one.amplitude / std(one)) ** 2 for one in limits]))
+        for std in (lambda one: one.without[TERM], lambda one: one.std)
+    )
+    assert alone > 1.5 and whole < 1.1
+    assert sum(one.fit.fits for one in limits) >= 58
 
 
 def test_templates_and_what_has_no_limit(tmp_path):
