@@ -144,7 +144,7 @@ def observed(
             raise
         # this raises any error that does not come from the sky above lmax
         setup = set_up(scenario.with_section("noise", above_lmax=None), data, stages)
-        doubts.append(f"The model ends at lmax = {scenario.lmax}, but the sky does not: {error}.")
+        doubts.append(f"The sky above lmax = {scenario.lmax} is not in the model: {error}.")
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     doubts += require_plausible(data, setup.signal, std)
     gains_known = data.calibration is not None and data.calibration.gain_names

@@ -187,6 +187,16 @@ ROUNDING_S = 1e-6
 EYE_S = 0.01
 
 
+PIECES_ADVICE = "change both, or omit the variables of the pieces"
+
+
+def require_same_times(what: str, off_s: Times, advice: str) -> None:
+    """Raise InputError if two statements on the same times differ by more than ``EYE_S``."""
+    if (off_s > EYE_S).any():
+        first = int(np.argmax(off_s > EYE_S))
+        raise InputError(f"{what} of sample {first} differ by {off_s[first]:g} s; {advice}")
+
+
 @dataclass(frozen=True, repr=False)
 class Windows(Described):
     """Start, end and live time of every piece of every sample.
@@ -298,24 +308,23 @@ class Windows(Described):
                 f"overlap by {-gaps[first]:g} s; give the length of the samples (step_s), or bounds"
             )
 
-    def require_bounds(self, times: Time, bounds: Any) -> None:
-        """Check bounds that were written for people against the windows of samples at these times.
+    def require_same(self, times: Time, bounds: Any = None, live_s: Any = None) -> None:
+        """Check bounds and live times, as written for people, against the windows at these times.
 
         Raises
         ------
         InputError
             If they differ by more than a hundredth of a second.
         """
-        seconds = seconds_from(times[:, None], utc_bounds(bounds, len(times)))
         if self.n_samples != len(times):
             return  # an Observation reports this
-        off = np.abs(seconds - self.bounds_s).max(axis=1)
-        if (off > EYE_S).any():
-            first = int(np.argmax(off > EYE_S))
-            raise InputError(
-                f"time_bounds and the pieces of sample {first} differ by {off[first]:g} s; change "
-                "both, or omit the variables of the pieces"
-            )
+        if bounds is not None:
+            seconds = seconds_from(times[:, None], utc_bounds(bounds, len(times)))
+            off = np.abs(seconds - self.bounds_s).max(axis=1)
+            require_same_times("time_bounds and the pieces", off, PIECES_ADVICE)
+        if live_s is not None:
+            off = np.abs(live_s - self.live_per_sample_s)
+            require_same_times("live_time and the pieces", off, PIECES_ADVICE)
 
     def select(self, keep: Bool[np.ndarray, " samples"]) -> Windows:
         """Return the windows of the samples where ``keep`` is True."""

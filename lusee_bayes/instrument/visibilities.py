@@ -30,6 +30,7 @@ from lusee_bayes.core.formats import as_dataset, read_netcdf, write_netcdf
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
 from lusee_bayes.core.reading import naming, require_file
+from lusee_bayes.instrument import times as at
 from lusee_bayes.instrument.beams.source import MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation, numbers_of_times, runs_of, site_of
 from lusee_bayes.instrument.products import N_ANTENNAS, DataLayout, labels_of, real_products
@@ -98,8 +99,7 @@ def read_windows(content: Content, times: Time) -> tuple[Time, Windows | None]:
         raise InputError(f"{given[0]} without {lost[0]}; pieces of windows need both")
     if not lost:
         windows = Windows(*(arrays[name] for name in PIECES))
-        if "time_bounds" in arrays:
-            windows.require_bounds(times, arrays["time_bounds"])
+        windows.require_same(times, arrays.get("time_bounds"), arrays.get("live_time"))
         return times, windows
     if "time_bounds" in arrays:
         step_s, live_s = content.values["step_s"], arrays.get("live_time")
@@ -427,6 +427,7 @@ LAYOUT = Layout(
         **{name: Variable(("time",), unit="d") for name in ("jd1", "jd2")},
         "run": Variable(("time",), "integer", low=0.0),
         "turntable_deg": Variable(("run_number",), unit="deg"),
+        "time": Variable(("time",), "time", optional=True),
         "time_bounds": Variable(("time", 2), "time", optional=True),
         "live_time": Variable(("time",), optional=True, unit="s"),
         "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
@@ -480,7 +481,11 @@ def read_visibilities(path: str | Path) -> Visibilities:
     checks.require_finite(f"{path}: visibility (where not flagged)", values)
     with naming(path):
         layout = DataLayout.from_flags(flags)
-        times, windows = read_windows(content, _utc_of_jd(content))
+        times = _utc_of_jd(content)
+        if "time" in arrays:
+            off = np.abs(at.seconds_from(times, utc_times(arrays["time"])))
+            at.require_same_times("time and jd1 + jd2", off, "change both, or omit time")
+        times, windows = read_windows(content, times)
         says_window = windows is not None or said.get("window") == "instant"
         runs = arrays["run"], tuple(arrays["turntable_deg"].tolist()), said["step_s"]
         seen = Observation(said["lon_deg"], said["lat_deg"], times, *runs, windows=windows)

@@ -217,6 +217,7 @@ def _sun_height(jd: Float[np.ndarray, " times"]) -> Float[np.ndarray, " times"]:
     return np.einsum("ti,ti->t", body_direction("Sun", far_side), far_side.zenith_galactic())
 
 
+UTC_ONLY = Attribute("text", choices=("UTC",), optional=True)
 SCALAR_WATERFALL = Layout(
     "a waterfall of luseepy's simulator",
     {
@@ -225,7 +226,7 @@ SCALAR_WATERFALL = Layout(
         "data": Variable(("time", "product", "freq"), finite=False, unit="K"),
         "combinations": Variable(("pair", 2), "integer", low=0.0, high=products.N_ANTENNAS - 1.0),
     },
-    {"LUNAR_DAY": Attribute("word"), **SITE_AND_STEP},
+    {"LUNAR_DAY": Attribute("word"), **SITE_AND_STEP, "TIMESYS": UTC_ONLY},
 )
 
 

@@ -239,8 +239,8 @@ def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
         names = [name for name, item in file.items() if isinstance(item, h5py.Dataset)]
         if dataset not in names:
             raise InputError(
-                f"{path} has no dataset '{dataset}' (it has {', '.join(sorted(names))}); "
-                f"{nearest(dataset, names)} Set the key dataset"
+                f"{path} has no dataset '{dataset}', as sky.dataset says (it has "
+                f"{', '.join(sorted(names))}); {nearest(dataset, names)}"
             )
         units = {f"{dataset}.units": file[dataset].attrs.get("units")}
         values = _layout(dataset).checked(path, {dataset: file[dataset]}, units).arrays[dataset]
@@ -366,7 +366,7 @@ class SkyAlms(SkyFile):
         if lmax > self.lmax:
             raise InputError(
                 f"{self.path} has coefficients up to ell = {self.lmax}, expected up to {lmax}; "
-                "lower lmax, or noise.above_lmax.least_lmax"
+                "lower lmax, or noise.above_lmax.treatment=ignored if the sky ends there"
             )
         mhz, channel = self.frequencies_mhz, 0
         if mhz is not None:

@@ -494,6 +494,7 @@ NOT_OF_A_FILE = [
     (attribute("window", "instant"), "declares instants, but piece_sample"),
     (attribute("window", "means"), "window is 'means'; did you mean 'mean'"),
     (shifted_bounds, "time_bounds and the pieces of sample 0 differ by 30 s"),
+    (changed("live_time", 7.0), "live_time and the pieces of sample 1 differ"),
     (changed("piece_start_s", np.nan), "piece_start_s.*NaN"),
     (changed("piece_sample", 0), "at least one piece for each"),
     (bounds_alone(changed("live_time", -1.0)), "sample 1 has a live time of -1 s"),
