@@ -81,7 +81,9 @@ SCALES = [("UTC", 0.0), ("tai", 37.0), ("TT", 69.184), ("tdb", 69.184)]
 def test_times_in_other_scales_are_brought_to_utc(data, tmp_path, scale, s):
     path = tmp_path / "other.nc"
     said = {"jd1": {"scale": scale}, "jd2": {"scale": scale}}
-    altered(lambda d: [d[k].attrs.update(said[k]) for k in said] and d.drop_vars("time"))(data, path)
+    altered(lambda d: [d[k].attrs.update(said[k]) for k in said] and d.drop_vars("time"))(
+        data, path
+    )
     within((data.observation.times - read_visibilities(path).observation.times).sec, s, 2e-3)
 
 
