@@ -21,11 +21,9 @@ from numpy.polynomial.chebyshev import chebvander
 from scipy.optimize import curve_fit
 from scipy.stats import foldnorm
 
-from lusee_bayes.core.arrays import Square, Vector
+from lusee_bayes.core import arrays, linalg, reading
 from lusee_bayes.core.errors import InputError, refusing
 from lusee_bayes.core.layouts import Layout, Variable
-from lusee_bayes.core.linalg import checked_cholesky
-from lusee_bayes.core.reading import read_table
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.results.sky_spectrum import OBSERVED, Frequencies, SkySpectrum
@@ -134,7 +132,7 @@ def signal_limit(
         )
     if not (np.isfinite(y) & (y > 0.0)).all():
         raise InputError(f"the {region} has temperatures that are not positive")
-    checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
+    linalg.checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
 
     def modelled(_: Frequencies, *values: float) -> Frequencies:
         return np.exp(smooth @ values[:-1]) + values[-1] * t
@@ -151,7 +149,7 @@ def signal_limit(
         values, _, found, *_ = curve_fit(*given, absolute_sigma=True, **options)
     amplitude, off = float(values[-1]), found["fvec"]
 
-    def error_under(covariance: Square) -> float:
+    def error_under(covariance: arrays.Square) -> float:
         columns = slopes(f, *values)
         normal = columns.T @ np.linalg.solve(covariance, columns)
         alike = f"{name}: a smooth spectrum of degree {order} looks the same; raise --order"
@@ -170,7 +168,7 @@ def signal_limit(
     return SignalLimit(name, region, amplitude, std, limit, fit, without)
 
 
-def named_template(text: str) -> tuple[str, Callable[[Frequencies], Vector]]:
+def named_template(text: str) -> tuple[str, Callable[[Frequencies], arrays.Vector]]:
     """A template from its text on the command line, with a name.
 
     Parameters
@@ -201,7 +199,7 @@ def named_template(text: str) -> tuple[str, Callable[[Frequencies], Vector]]:
         raise InputError(
             f"no template '{text}'; give trough:MHZ:WIDTH, excess, constant or a CSV file"
         )
-    table = read_table(Path(text), TABLE)
+    table = reading.read_table(Path(text), TABLE)
     mhz, kelvin = table["frequency_mhz"], table["temperature_k"]
     shape = kelvin / (np.abs(kelvin).max() or 1.0)
     return f"{Path(text).stem}, at its peak", lambda f: np.interp(f, mhz, shape, np.nan, np.nan)
