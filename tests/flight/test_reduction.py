@@ -10,9 +10,8 @@ from assertions import refuse
 from astropy import units as u
 from naive_flight import FLIGHT_ORDER, naive_band
 
+from lusee_bayes.flight import gain_model, reduction
 from lusee_bayes.flight import reduced as rd
-from lusee_bayes.flight import reduction
-from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.recipe import FlightSection, Recipe, timeline
 from lusee_bayes.flight.reduction import reduce_sessions
 from lusee_bayes.flight.session_files import read_session
@@ -38,7 +37,7 @@ def truth(flight):
 
 @pytest.fixture(scope="module")
 def table(flight):
-    return read_gain_table(flight / "gain")
+    return gain_model.read_gain_table(flight / "gain")
 
 
 def sessions(flight, names="abcd"):
@@ -259,9 +258,8 @@ def test_the_turntable_turns_when_the_scenario_says(flight, table, reduced):
     given = recipe(table, timestamp="start", turns={(times[3] + 60.0 * u.s).isot: 30.0})
     one = reduce_sessions([at, *sessions(flight, "bcd")], given)
     np.testing.assert_array_equal(one.reason[:, 2:5] == rd.NO_DATA, [[False, True, False]] * 2)
-    refuse(
-        "flight.turns.*noon", reduce_sessions, sessions(flight), recipe(table, turns={"noon": 3})
-    )
+    given = recipe(table, turns={"noon": 3})
+    refuse("flight.turns.*noon", reduce_sessions, sessions(flight), given)
 
 
 def test_an_auto_of_zero_takes_its_port_along(flight, table, tmp_path):
