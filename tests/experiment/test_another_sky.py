@@ -97,6 +97,12 @@ def test_what_n_is_built_around_by_default():
     noisy = wrong_data.changed(scenario, "noise.radiometer.bandwidth_hz=100")
     assert radiometer_about(set_up(noisy, data)) == "posterior"
     absent = np.zeros(grid.shape, dtype=bool)
+    absent[4] = True
+    # a cross: the exact form of the noise depends on it, the independent one does not
+    for form, about in (("exact", "posterior"), ("paper", "measured")):
+        formed = wrong_data.changed(scenario, f"noise.radiometer.form={form}")
+        assert radiometer_about(set_up(formed, flagged(data, absent))) == about
+    absent = np.zeros(grid.shape, dtype=bool)
     absent[7] = True
     partly = flagged(data, absent)
     setup = set_up(scenario, partly)

@@ -111,7 +111,7 @@ def test_the_sentence_names_what_moves_the_map_and_is_not_seen():
 
 
 @pytest.mark.essential
-def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them():
+def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them(monkeypatch):
     beam = "noise.beam={parameters: {surface_permittivity: 0.2, zenith_angle_deg: 1}}"
     runs = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
     experiment = lb.build(scenario_of(ISOTROPIC, beam, runs, lmax=5, step_s=43200.0))
@@ -127,6 +127,9 @@ def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them():
     wrong = rms_of_directions(first, found.posterior.mean)
     assert k > validity.LARGEST_K and wrong / 3.0 < moved_by < 3.0 * wrong
     assert "its errors are not valid" in validity.reach(experiment, first)[0]
+    # a few draws may miss where the Gaussian is wrong: even weights are not sufficient
+    monkeypatch.setattr(validity, "weighed", lambda *_: (0.1, 2.0 * validity.LARGEST_MOVE))
+    assert "its errors are not valid" in validity.reach(experiment, found)[0]
 
 
 def test_nothing_is_weighed_where_nothing_was_found_in_rounds(plain):

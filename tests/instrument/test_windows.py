@@ -404,6 +404,8 @@ def test_bounds_of_other_software_are_windows(tmp_path, units):
         dataset = without_pieces(dataset).drop_vars("live_time")
         at_start = Time(START, scale="utc") + HOUR * np.arange(4) * u.s
         dataset["jd1"][:], dataset["jd2"][:] = at_start.jd1, at_start.jd2
+        stamps = at_start.datetime64.astype("datetime64[ns]")
+        dataset = dataset.assign_coords(time=("time", stamps, dataset["time"].attrs))
         dataset["live_time"] = ("time", 0.25 * HOUR * np.ones(4))
         # as xarray writes them: bounds without units of their own
         dataset["time"].encoding = {"units": units, "dtype": "float64"}

@@ -19,7 +19,7 @@ from lusee_bayes.experiment.model import full_model
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.judge import left_out, measures
 from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare, stands_out
-from lusee_bayes.judge.left_out import KINDS, LeftOut, groups_of
+from lusee_bayes.judge.left_out import KINDS, LeftOut, groups_of, roots
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.judge.split import WIDER, Split, widened
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap, form_of
@@ -135,9 +135,19 @@ PRIORS = [(10.0, "narrower prior", "too narrow"), (0.1, "too narrow", "narrower 
 def test_a_prior_that_is_too_wide_is_told_from_one_that_is_too_narrow(width, said, not_said):
     """The same data, under a prior ten times as wide as the sky's, and as narrow."""
     model, data = simulated()
-    fit = judged(replace(model, prior=model.prior.widened(width)), data).fit()
-    assert fit.level == "unlike the prior"
-    assert said in fit.text and not_said not in fit.text
+    found = judged(replace(model, prior=model.prior.widened(width)), data)
+    assert found.fit().level == "unlike the prior"
+    assert said in found.fit().text and not_said not in found.fit().text
+    # one that was fitted to these data is not too wide
+    learned = replace(found, learned=True)
+    assert learned.level() == ("consistent" if width > 1.0 else "unlike the prior")
+
+
+def test_weights_that_rounding_makes_indefinite_have_no_roots():
+    weights = np.array([np.eye(2), [[1.0, 2.0], [2.0, 1.0]]])
+    found = roots(weights, np.ones((2, 2), dtype=bool))
+    np.testing.assert_array_equal(found[0], np.eye(2))
+    assert np.isnan(found[1]).all()
 
 
 def test_one_group_is_everything():

@@ -98,17 +98,35 @@ def test_learning_gains_over_the_start_under_local_scales():
     assert [row["name"] for row in found.as_rows()] == list(family.names)
 
 
-def test_a_sky_without_texture_has_none():
-    """Data that only limit the texture's level: the best is where it no longer matters."""
+def test_a_texture_that_data_only_limit_is_as_strong_as_they_allow():
+    """Its level is ln of the mean variance over its posterior, here on a finer and longer grid."""
     family = local_scales.embedded_local_scales(25.0, LMAX)
     information = information_of(1.02 * family.mean)
     found = learning.learn_whatever_fits(family, information)
     assert found.settled and found.noise_factor == 1.0
     mean, about = family.hyperprior.moments(found.scores.mean, found.scores.covariance)
-    mean[0] = -300.0
-    none = family.prior(family.averaged(mean, about))
-    best, expected = (float(information.posterior(p).log_evidence) for p in (found.prior, none))
-    assert best > expected - 0.1
+    first = np.arange(len(mean)) == 0
+
+    def evidence(shift):
+        prior = family.prior(family.averaged(mean + shift * first, about))
+        return float(information.posterior(prior).log_evidence)
+
+    shifts = np.arange(-12.0, 8.0, 0.5)
+    log_p = [evidence(by) + family.hyperprior.log_density(mean + by * first) for by in shifts]
+    assert abs(special.logsumexp(log_p + shifts) - special.logsumexp(log_p)) < 0.7
+    # the data hardly care whether there is any
+    assert abs(evidence(0.0) - evidence(-300.0)) < 2.0
+
+
+def test_parameters_too_uncertain_to_be_averaged_have_their_most_probable_values(case, monkeypatch):
+    def infinite(*_):
+        raise lb.InputError("too large")
+
+    monkeypatch.setattr(IsotropicFamily, "averaged", infinite)
+    found = learning.learn(case.family, case.information)
+    most_probable = case.family.at(found.parameters).covariance
+    np.testing.assert_allclose(found.prior.variance(), np.diagonal(most_probable), rtol=1e-12)
+    assert found.scores.covariance.max() < 1e-5
 
 
 def test_variances_beyond_the_data_are_means_over_parameters(case):

@@ -1,5 +1,6 @@
 """simulate --flight, and map its sessions: the whole chain, and what a report says of it."""
 
+import json
 import shlex
 import shutil
 from dataclasses import replace
@@ -13,12 +14,13 @@ from matplotlib.figure import Figure
 
 import lusee_bayes as lb
 from lusee_bayes.core.reading import parse_yaml
-from lusee_bayes.experiment.data_files import reduce_files
+from lusee_bayes.experiment.data_files import read_data, reduce_files
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.report import pages, rendering
 from lusee_bayes.report.figures.judgement import calibration
 from lusee_bayes.runs.data_run import reduced_lines, run_simulate_flight
+from lusee_bayes.sky.sky_source import read_sky_file
 
 SET = ["lmax=3", "frequency_mhz=20", "observation.step_s=900", "observation.runs=[{cycles: 0.003}]"]
 SET += ["noise.radiometer.form=exact", "flight={per_kelvin_v2_hz: 1e-21}"]
@@ -59,6 +61,26 @@ def test_a_map_of_simulated_sessions_has_the_sky_that_was_simulated(tmp_path, ca
     off = (found["mean"] - found["truth"]).values[0]
     chi2 = off @ np.linalg.solve(found["covariance"].values[0], off)
     assert abs(chi2 / len(off) - 1.0) < 4.0 * np.sqrt(2.0 / len(off))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("lmax", [14, 20])
+def test_a_map_of_written_sessions_covers_a_smooth_sky_that_they_hardly_show(
+    flight, test_data, tmp_path, lmax
+):
+    """Data of a sky without the texture of the prior, whose strength they only limit."""
+    beam = {"model": "response", "receiver": {"model": "jfet"}, "moon_temperature_k": 250}
+    beam |= {"file": str(test_data / "luseepy" / "synthetic_response_v3.fits"), "exact": True}
+    said = {"frequency_mhz": 10, "lmax": lmax, "observation": {"timestamp": "middle"}, "beam": beam}
+    said["noise"] = {"receiver": {"power_v2_hz": 4.0e-20, "relative_std": 0.3}}
+    said["flight"] = {"gain_table": str(flight / "gain"), "bin_origin": "centre"}
+    (tmp_path / "scenario.yaml").write_text(json.dumps(said))
+    scenario = lb.load_scenario(tmp_path / "scenario.yaml").of_measured()
+    data = read_data([flight / f"session_{name}.h5" for name in "abcd"], scenario)
+    posterior = lb.infer(lb.build(scenario, data)).posterior
+    truth = read_sky_file(test_data / "luseepy" / "sky_alm.npz").modes_at(10.0, lmax)
+    assert (posterior.whiten(truth[None]) ** 2).mean() < 6.0
+    assert abs(truth - posterior.mean)[0] < 4.0 * posterior.std()[0]
 
 
 def test_fits_and_a_gain_table_of_ones_own(tmp_path):

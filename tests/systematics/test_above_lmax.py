@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 import lusee_bayes as lb
+from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.linalg import main_directions
+from lusee_bayes.experiment.experiment import observed
 from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate, true_signal
+from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.systematics import above_lmax, context
 
 LMAX, MARGIN, N = 5, 4, 36
@@ -49,6 +52,14 @@ def test_integrated_out_is_the_marginal_of_the_posterior_of_all_modes(both, monk
     # N is inverted with columns of up to 1e5 times the noise: 1e-16 x (1e5)^2 is lost
     assert np.abs((posterior.mean - expected[:N]) / std[:N]).max() < 1e-3
     np.testing.assert_allclose(posterior.std(), std[:N], rtol=1e-4)
+
+
+def test_a_file_of_simulated_data_says_that_the_sky_does_not_end_at_lmax(both, tmp_path):
+    lb.run_simulate(both[0], tmp_path / "data.nc")
+    data = read_visibilities(tmp_path / "data.nc")
+    assert len(data.truth) == n_modes(LMAX + MARGIN)
+    seen = observed(both[0], data)
+    assert seen.scenario.noise.above_lmax is not None and len(seen.data.truth) == N
 
 
 def test_simulated_data_hold_what_the_sky_has_above_lmax(both):
