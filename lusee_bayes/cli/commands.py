@@ -15,24 +15,8 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from lusee_bayes.cli.options import (
-    Algorithm,
-    ChainOptions,
-    Count,
-    DataOptions,
-    Duration,
-    EngineOptions,
-    Flag,
-    Frequencies,
-    Licence,
-    Many,
-    Number,
-    Options,
-    Quiet,
-    Repeated,
-    ScenarioOptions,
-    say,
-)
+from lusee_bayes.cli import options as option
+from lusee_bayes.cli.options import say
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.version import release
 
@@ -60,17 +44,17 @@ FIRST_MAP = "first_map"
 def map_command(
     scenario: str | None = None,
     *,
-    truth: Flag = False,
-    draws: Number | None = None,
-    covariance: Flag = False,
-    information: Flag = False,
+    truth: option.Flag = False,
+    draws: option.Number | None = None,
+    covariance: option.Flag = False,
+    information: option.Flag = False,
     add: Path | None = None,
-    diagnose: Flag = False,
-    frequencies: Frequencies | None = None,
-    joint: Flag = False,
-    open: Flag = False,
-    options: DataOptions = DataOptions(),
-    engine: EngineOptions = EngineOptions(),
+    diagnose: option.Flag = False,
+    frequencies: option.Frequencies | None = None,
+    joint: option.Flag = False,
+    open: option.Flag = False,
+    options: option.DataOptions = option.DataOptions(),
+    engine: option.EngineOptions = option.EngineOptions(),
 ) -> None:
     """Compute a posterior map of the sky from simulated or given data.
 
@@ -123,7 +107,7 @@ def map_command(
     kept["output__information"] = information
     loaded = options.load(scenario, frequencies_mhz=frequencies, joint=joint, **kept)
     several = bool(loaded.frequencies_mhz)
-    if not several and engine != EngineOptions():
+    if not several and engine != option.EngineOptions():
         raise InputError("--workers and --cluster distribute channels; give --frequencies")
     with engine.open(demand_of(loaded)) if several else nullcontext() as opened:
         given = {"truth": truth, "earlier": add, "thorough": diagnose}
@@ -143,9 +127,9 @@ def look_at(page: Path, open_it: bool) -> str:
 def simulate_command(
     scenario: str,
     *,
-    frequencies: Frequencies | None = None,
-    flight: Flag = False,
-    options: ScenarioOptions = ScenarioOptions(),
+    frequencies: option.Frequencies | None = None,
+    flight: option.Flag = False,
+    options: option.ScenarioOptions = option.ScenarioOptions(),
 ) -> None:
     """Simulate visibilities for a scenario.
 
@@ -188,9 +172,9 @@ def reduce_command(
     files: Annotated[list[Path], Parameter(required=True)],
     /,
     *,
-    frequencies: Frequencies | None = None,
+    frequencies: option.Frequencies | None = None,
     clock: str | None = None,
-    options: ScenarioOptions = ScenarioOptions(),
+    options: option.ScenarioOptions = option.ScenarioOptions(),
 ) -> None:
     """Calibrate, flag and average spectrometer sessions.
 
@@ -229,10 +213,10 @@ def reduce_command(
 def average_command(
     data: Path,
     *,
-    to: Duration,
+    to: option.Duration,
     scenario: str = "fiducial",
-    no_information: Flag = False,
-    options: ScenarioOptions = ScenarioOptions(),
+    no_information: option.Flag = False,
+    options: option.ScenarioOptions = option.ScenarioOptions(),
 ) -> None:
     """Average data over longer times and report the information lost.
 
@@ -269,10 +253,10 @@ def sample_command(
     scenario: str,
     *,
     model: str | None = None,
-    algorithm: Algorithm | None = None,
-    frequencies: Frequencies | None = None,
-    options: DataOptions = DataOptions(),
-    chains: ChainOptions = ChainOptions(),
+    algorithm: option.Algorithm | None = None,
+    frequencies: option.Frequencies | None = None,
+    options: option.DataOptions = option.DataOptions(),
+    chains: option.ChainOptions = option.ChainOptions(),
 ) -> None:
     """Sample the posterior of a NumPyro program with Hamiltonian Monte Carlo.
 
@@ -318,10 +302,10 @@ def sample_command(
 def validate_command(
     scenario: str,
     *,
-    simulations: Count = 500,
-    options: DataOptions = DataOptions(),
-    chains: ChainOptions = ChainOptions(),
-    engine: EngineOptions = EngineOptions(),
+    simulations: option.Count = 500,
+    options: option.DataOptions = option.DataOptions(),
+    chains: option.ChainOptions = option.ChainOptions(),
+    engine: option.EngineOptions = option.EngineOptions(),
 ) -> int:
     """Check the posterior of a scenario with HMC and simulated data sets.
 
@@ -360,9 +344,9 @@ def validate_command(
 def plan_command(
     scenario: str,
     *others: str,
-    vary: Annotated[tuple[str, ...], Repeated] = (),
-    options: ScenarioOptions = ScenarioOptions(),
-    engine: EngineOptions = EngineOptions(),
+    vary: Annotated[tuple[str, ...], option.Repeated] = (),
+    options: option.ScenarioOptions = option.ScenarioOptions(),
+    engine: option.EngineOptions = option.EngineOptions(),
 ) -> None:
     """Forecast the information content of observations, without data.
 
@@ -400,7 +384,7 @@ def plan_command(
 
 
 @app.command(name="compare", group="Results")
-def compare_command(*folders: Path, options: Options = Options()) -> None:
+def compare_command(*folders: Path, options: option.Options = option.Options()) -> None:
     """Compare finished map runs: maps, spectra, evidence.
 
     comparison.html, comparison.csv and the figures go to output/comparison, or to the folder given
@@ -425,7 +409,7 @@ def compare_command(*folders: Path, options: Options = Options()) -> None:
 
 
 @app.command(name="report", group="Results")
-def report_command(folder: Path, *, open: Flag = False, quiet: Quiet = False) -> None:
+def report_command(folder: Path, *, open: option.Flag = False, quiet: option.Quiet = False) -> None:
     """Rebuild report.html from the results in a run folder.
 
     **Examples**
@@ -451,10 +435,10 @@ def spectrum_command(
     run: Path,
     *,
     region: str = "observed sky",
-    signal: Annotated[tuple[str, ...], Repeated] = (),
+    signal: Annotated[tuple[str, ...], option.Repeated] = (),
     order: int = 6,
     figure: Path | None = None,
-    table: Annotated[tuple[Path, ...], Repeated] = (),
+    table: Annotated[tuple[Path, ...], option.Repeated] = (),
 ) -> None:
     """Print the spectrum of the sky of a finished map of several channels.
 
@@ -514,10 +498,10 @@ def export_command(
     *,
     release: Path | None = None,
     skyh5: Path | None = None,
-    creator: Annotated[tuple[str, ...], Repeated] = (),
+    creator: Annotated[tuple[str, ...], option.Repeated] = (),
     doi: str = "",
-    license: Licence = "CC-BY-4.0",
-    quiet: Quiet = False,
+    license: option.Licence = "CC-BY-4.0",
+    quiet: option.Quiet = False,
 ) -> None:
     """Bundle a finished run for publication, or write its map for pyradiosky.
 
@@ -596,7 +580,9 @@ def info_command(files: Annotated[list[Path], Parameter(required=True)], /) -> i
 
 
 @app.command(name="keys", group="Scenarios")
-def keys_command(key: str = "", *, markdown: Flag = False, schema: Flag = False) -> None:
+def keys_command(
+    key: str = "", *, markdown: option.Flag = False, schema: option.Flag = False
+) -> None:
     """List every setting of a scenario, with its meaning, unit, choices and default.
 
     **Examples**
@@ -639,7 +625,7 @@ def scenarios_command() -> None:
 
 
 @app.command(name="init", group="Scenarios")
-def init_command(file: Path, *, like: str = FIRST_MAP, force: Flag = False) -> None:
+def init_command(file: Path, *, like: str = FIRST_MAP, force: option.Flag = False) -> None:
     """Write a commented scenario to edit.
 
     **Examples**
@@ -669,9 +655,9 @@ def init_command(file: Path, *, like: str = FIRST_MAP, force: Flag = False) -> N
 @app.command(name="paper", group="Results")
 def paper_command(
     *,
-    sky: Annotated[tuple[Path, ...], Many] = (),
-    options: Options = Options(),
-    engine: EngineOptions = EngineOptions(),
+    sky: Annotated[tuple[Path, ...], option.Many] = (),
+    options: option.Options = option.Options(),
+    engine: option.EngineOptions = option.EngineOptions(),
 ) -> None:
     """Reproduce the figures of the reference paper and check its claims.
 
