@@ -26,16 +26,8 @@ from lusee_bayes.noise.instrument_errors import (
     white_grid,
     with_gains,
 )
+from lusee_bayes.systematics import systematic
 from lusee_bayes.systematics.context import Around, NoiseAbout, Setup, Volume, noise_visibilities
-from lusee_bayes.systematics.systematic import (
-    SKY,
-    Chart,
-    Systematic,
-    Truth,
-    Unknown,
-    multiplied,
-    with_added,
-)
 
 # how far an unknown correlation time can be off, in standard deviations of its ln, and by which
 # factor at least, for programs that set it themselves
@@ -94,7 +86,7 @@ class GainSection(Section):
     )
 
 
-class GainDrifts(Systematic):
+class GainDrifts(systematic.Systematic):
     """Drifts of every antenna's gain, with known or uncertain strength and correlation time.
 
     Attributes
@@ -198,7 +190,7 @@ class GainDrifts(Systematic):
         return replace(drifts, shift=(drifts.slopes * off[:, None]).sum(0))
 
     @classmethod
-    def truth(cls, section: GainSection, setup: Setup, key: PRNGKeyArray) -> Truth:
+    def truth(cls, section: GainSection, setup: Setup, key: PRNGKeyArray) -> systematic.Truth:
         """The scales: if unknown, drawn from the same prior as in programs."""
         with _HANDLERS, numpyro.handlers.seed(rng_seed=jax.random.fold_in(key, SCALE_DRAW)):
             drift = cls.build(section, setup, Around()).scales()
@@ -209,7 +201,9 @@ class GainDrifts(Systematic):
         """Multiply by one draw of the drifts."""
         drift = GainDrift(truth["gain_sigma"], truth["gain_correlation_h"])
         gains = drift.sample(cls.own_key(key), setup.observation.hours)
-        return multiplied(model, np.asarray(cls.build(section, setup, Around()).response(gains)))
+        return systematic.multiplied(
+            model, np.asarray(cls.build(section, setup, Around()).response(gains))
+        )
 
     @property
     def n_antennas(self) -> int:
@@ -224,7 +218,7 @@ class GainDrifts(Systematic):
         """
         sigma, correlation_h = self.drift.sigma, self.drift.correlation_h
         if self.log_sigma_std is not None:
-            prior = Unknown("gain_sigma", sigma, self.log_sigma_std, log=True).prior()
+            prior = systematic.Unknown("gain_sigma", sigma, self.log_sigma_std, log=True).prior()
             sigma = numpyro.sample("gain_sigma", prior)
         if self.log_correlation_std is not None:
             reach = CORRELATION_REACH * self.log_correlation_std
@@ -285,9 +279,9 @@ class GainDrifts(Systematic):
         drift = drift or self.drift
         if self.found is None:
             mean = drift.mean_response(self.layout.n_products)
-            return multiplied(model, mean[self.layout.product])
-        found = multiplied(model, self.response(self.found))
-        return with_added(found, self.layout.gather(self.shift))
+            return systematic.multiplied(model, mean[self.layout.product])
+        found = systematic.multiplied(model, self.response(self.found))
+        return systematic.with_added(found, self.layout.gather(self.shift))
 
     @property
     def about(self) -> Gains:
@@ -349,7 +343,7 @@ class GainDrifts(Systematic):
 
     def effect(self, model, values):
         """Multiply by the response to ``gains``."""
-        return multiplied(model, self.response(values["gains"]))
+        return systematic.multiplied(model, self.response(values["gains"]))
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """Sample the sites of :meth:`scales` and :meth:`histories`."""
@@ -361,7 +355,7 @@ def gains_about(setup: Setup) -> NoiseAbout:
     return setup.scenario.noise.gain.visibilities or "posterior"
 
 
-class GainCoordinates(Chart):
+class GainCoordinates(systematic.Chart):
     """Coordinates that remove the degeneracy of gains and sky.
 
     (1 + g_i)(1 + g_j) A m stays the same if all 1 + g grow by exp(k) and m shrinks by its square.
@@ -386,7 +380,7 @@ class GainCoordinates(Chart):
     def names(self) -> tuple[str, ...]:
         stds = self.drifts.log_sigma_std, self.drifts.log_correlation_std
         sites = [name for name, std in zip(SCALES, stds, strict=True) if std is not None]
-        return (SKY, GAIN_NOISE, *sites)
+        return (systematic.SKY, GAIN_NOISE, *sites)
 
     @property
     def factorises(self) -> bool:
@@ -397,8 +391,8 @@ class GainCoordinates(Chart):
         mean, constant = self._shared()
         scale = (mean * noise).sum()
         noise = jnp.exp(scale) * (noise + (1.0 - scale) * constant) - constant
-        values[SKY] = x[SKY] * jnp.exp(-2.0 * scale)
-        log_det = (noise.size - 2 * x[SKY].size) * scale
+        values[systematic.SKY] = x[systematic.SKY] * jnp.exp(-2.0 * scale)
+        log_det = (noise.size - 2 * x[systematic.SKY].size) * scale
         if self.factorises:
             before, after = self._shapes(x)
             gains, mixed = self._covariances(before, after)
@@ -416,7 +410,7 @@ class GainCoordinates(Chart):
         mean, constant = self._shared()
         scale = jnp.log1p((mean * noise).sum())
         x[GAIN_NOISE] = (noise + constant) * jnp.exp(-scale) - (1.0 - scale) * constant
-        x[SKY] = values[SKY] * jnp.exp(2.0 * scale)
+        x[systematic.SKY] = values[systematic.SKY] * jnp.exp(2.0 * scale)
         return x
 
     def _shared(self) -> tuple[Float[Array, "1 grid"], Float[Array, "1 grid"]]:

@@ -21,16 +21,8 @@ from lusee_bayes.core.arrays import Array, DataVector, namespace, on_device
 from lusee_bayes.core.harmonics import Rotation, generators
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment, requires
+from lusee_bayes.instrument import pointing as pointings
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
-from lusee_bayes.instrument.pointing import (
-    CLOCK,
-    OFFSETS,
-    Pointing,
-    offset_kind,
-    offset_names,
-    turned_by_offsets,
-    with_offsets,
-)
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.sources import SOURCE_NODES, source_responses
@@ -79,13 +71,13 @@ class PointingSection(Section):
 
     _something_is_not_known = requires(
         lambda section: section.kinds,
-        f"give a standard deviation for at least one of {', '.join(OFFSETS)}",
+        f"give a standard deviation for at least one of {', '.join(pointings.OFFSETS)}",
     )
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of the unknown offsets."""
-        return tuple(kind for kind in OFFSETS if getattr(self, kind) is not None)
+        return tuple(kind for kind in pointings.OFFSETS if getattr(self, kind) is not None)
 
 
 class PointingOffsets(Systematic):
@@ -119,7 +111,7 @@ class PointingOffsets(Systematic):
 
     unknowns: tuple[Unknown, ...] = eqx.field()
     expansion_point: Float[Array, "2"]
-    pointing: Pointing
+    pointing: pointings.Pointing
     hours: Float[Array, " times"]
     mcmf_from_lander: Float[Array, "3 3"]
     layout: DataLayout
@@ -131,8 +123,8 @@ class PointingOffsets(Systematic):
 
     @classmethod
     def build(cls, section: PointingSection, setup: Setup, around: Around) -> PointingOffsets:
-        names = offset_names(section.kinds, setup.observation.n_runs)
-        stds = {name: float(getattr(section, offset_kind(name))) for name in names}
+        names = pointings.offset_names(section.kinds, setup.observation.n_runs)
+        stds = {name: float(getattr(section, pointings.offset_kind(name))) for name in names}
         return cls.of(setup, stds, {name: (around.values or {}).get(name, 0.0) for name in names})
 
     @classmethod
@@ -140,13 +132,13 @@ class PointingOffsets(Systematic):
         cls, setup: Setup, stds: Mapping[str, float], values: Mapping[str, float]
     ) -> PointingOffsets:
         """Build it for a setup moved to values, with these prior standard deviations."""
-        back = {name: -value for name, value in values.items() if name not in CLOCK}
-        observation = with_offsets(setup.observation, back)
+        back = {name: -value for name, value in values.items() if name not in pointings.CLOCK}
+        observation = pointings.with_offsets(setup.observation, back)
         pointing = setup.pointing.placed(observation)
         ignored = not setup.responses or setup.scenario.sources.treatment == "ignored"
         return cls(
             tuple(Unknown(name, 0.0, std) for name, std in stds.items()),
-            np.array([values.get(name, 0.0) for name in CLOCK]),
+            np.array([values.get(name, 0.0) for name in pointings.CLOCK]),
             pointing,
             setup.observation.hours,
             observation.lander_from_mcmf().T,
@@ -157,15 +149,15 @@ class PointingOffsets(Systematic):
     @classmethod
     def moved(cls, section: PointingSection, setup: Setup, values: Values) -> Setup:
         """Change times and places: A, the responses to sources, and the signal."""
-        names = offset_names(section.kinds, setup.observation.n_runs)
+        names = pointings.offset_names(section.kinds, setup.observation.n_runs)
         offsets = {name: value for name, value in values.items() if name in names}
         return shifted(setup, offsets) if offsets else setup
 
-    def turned(self, values: Values) -> Pointing:
+    def turned(self, values: Values) -> pointings.Pointing:
         """The pointing for values by name."""
-        clock = dict(zip(CLOCK, self.expansion_point, strict=True))
+        clock = dict(zip(pointings.CLOCK, self.expansion_point, strict=True))
         left = {name: values[name] - clock.get(name, 0.0) for name in self.names}
-        return turned_by_offsets(self.pointing, self.hours, left)
+        return pointings.turned_by_offsets(self.pointing, self.hours, left)
 
     def effect(self, model, values):
         """Use A with the offsets; sources with their mean fluxes move, too."""
@@ -305,10 +297,10 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
     """The setup with another observation, its A and its responses to sources."""
     given = ", ".join(f"{name} = {value:g}" for name, value in values.items() if value)
     with naming(f"noise.pointing, with {given or 'no offsets'}"):
-        observation = with_offsets(setup.observation, values)
-    if any(values.get(name) for name in CLOCK):
+        observation = pointings.with_offsets(setup.observation, values)
+    if any(values.get(name) for name in pointings.CLOCK):
         frame = np.asarray(setup.pointing.pole_frame)
-        pointing = Pointing.of(observation, setup.sky.lmax, pole_frame=frame)
+        pointing = pointings.Pointing.of(observation, setup.sky.lmax, pole_frame=frame)
     else:  # the sky turns as before
         pointing = setup.pointing.placed(observation)
     inputs = setup.scenario, observation, setup.beam_source, setup.frequency_mhz

@@ -45,13 +45,7 @@ from lusee_bayes.core.harmonics import azimuth_functions, mode_numbers, per_mode
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import Section, Treatment
-from lusee_bayes.instrument.beams.fields import (
-    AntennaFields,
-    HemisphereGrid,
-    beam_scale,
-    product_modes,
-    stokes_beam,
-)
+from lusee_bayes.instrument.beams import fields as beam_fields
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import to_real
@@ -108,14 +102,14 @@ class Polarisation(LowRankNoise):
 
     @classmethod
     def build(cls, section: PolarisationSection, setup: Setup, around: Around) -> Polarisation:
-        grid, lmax = HemisphereGrid.for_lmax(section.lmax), section.lmax
+        grid, lmax = beam_fields.HemisphereGrid.for_lmax(section.lmax), section.lmax
         with naming(cls.key):
             fields = setup.beam_source.fields(setup.beams.frequency_mhz, grid)
-        scale = beam_scale(fields, setup.beams)
+        scale = beam_fields.beam_scale(fields, setup.beams)
         mean = float(setup.sky.modes[0]) / np.sqrt(4.0 * np.pi)
         beams: list[tuple[float, int, Modes]] = []
         if section.circular:
-            v = product_modes(fields, lmax, stokes="V", normalise=False)
+            v = beam_fields.product_modes(fields, lmax, stokes="V", normalise=False)
             beams.append((section.circular, CIRCULAR, v))
         if section.linear:
             # each has half of the power
@@ -144,7 +138,7 @@ def unit_spectrum(lmax: int, lowest: int, slope: float) -> Float[np.ndarray, " e
     return 4.0 * np.pi * shape / ((2.0 * ell + 1.0) @ shape)
 
 
-def linear_modes(fields: AntennaFields, lmax: int) -> tuple[Modes, Modes]:
+def linear_modes(fields: beam_fields.AntennaFields, lmax: int) -> tuple[Modes, Modes]:
     """Return the coefficients of the products' beams for E and for B modes.
 
     Parameters
@@ -170,7 +164,9 @@ def linear_modes(fields: AntennaFields, lmax: int) -> tuple[Modes, Modes]:
     # df_m / dphi is m f_-m
     odd = -2.0 * weights * m * (slope - cot * polar) / sin
     azimuth = azimuth_functions(grid.phi, lmax)
-    q, u = (np.asarray(to_real(stokes_beam(fields, stokes))) @ azimuth for stokes in "QU")
+    q, u = (
+        np.asarray(to_real(beam_fields.stokes_beam(fields, stokes))) @ azimuth for stokes in "QU"
+    )
 
     def summed(pattern: Array, polar: Array, orders: Array) -> Modes:
         return np.einsum("ktc,tc->kc", pattern[..., lmax + orders], polar)

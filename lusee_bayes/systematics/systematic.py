@@ -52,12 +52,7 @@ from lusee_bayes.core.section import Section
 from lusee_bayes.instrument.coupling import BeamModes, DenseCoupling
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.noise.covariance import (
-    Covariance,
-    DiagonalCovariance,
-    LowRankCovariance,
-    LowRankUpdate,
-)
+from lusee_bayes.noise import covariance as covariances
 from lusee_bayes.sky.prior import IndependentPrior
 from lusee_bayes.systematics.context import Around, Setup
 
@@ -417,7 +412,7 @@ class Systematic(eqx.Module):
             if not self.changes_coupling:  # one mode: the strength of this sky
                 coupling, prior = DenseCoupling((coupling @ sky)[:, None]), IndependentPrior(unit)
                 sky = unit
-            noise = DiagonalCovariance(np.ones(model.n_data))
+            noise = covariances.DiagonalCovariance(np.ones(model.n_data))
             bare = LinearGaussian(coupling, prior, noise, model.offset)
             return np.asarray(_columns(*on_device((self, bare, sky, centre))))
 
@@ -571,7 +566,7 @@ class Expanded(Marginalised):
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Apply the effect at z_0, add T T^T to N and T (expected - z_0) to the mean."""
-        noise = model.noise + LowRankCovariance(self.columns, self.systematic.words)
+        noise = model.noise + covariances.LowRankCovariance(self.columns, self.systematic.words)
         at_centre = self.systematic.effect(model, self.systematic.values(self.centre))
         return with_added(replace(at_centre, noise=noise), self.shift)
 
@@ -643,7 +638,7 @@ class AdditiveNoise(Systematic):
     layout: DataLayout
 
     @abstractmethod
-    def covariance(self) -> Covariance:
+    def covariance(self) -> covariances.Covariance:
         """Return its covariance over the entries of the data vector, in K^2."""
 
     @property
@@ -673,8 +668,8 @@ class LowRankNoise(AdditiveNoise):
     def behind(self, gains: DataVector) -> LowRankNoise:
         return replace(self, root=self.root * np.asarray(gains)[:, None])
 
-    def covariance(self) -> LowRankCovariance:
-        return LowRankCovariance(self.root, self.words)
+    def covariance(self) -> covariances.LowRankCovariance:
+        return covariances.LowRankCovariance(self.root, self.words)
 
 
 class Temperatures(Systematic):
@@ -728,7 +723,7 @@ def multiplied(model: LinearGaussian, response: DataVector) -> LinearGaussian:
     """Multiply a model's sky, offset and unknowns in N by gains."""
     offset = None if model.offset is None else model.offset * response
     coupling, noise = model.coupling.with_response(response), model.noise
-    if isinstance(noise, LowRankUpdate):
+    if isinstance(noise, covariances.LowRankUpdate):
         root = (noise.update.root.T * response[None]).T
         noise = replace(noise, update=replace(noise.update, root=root))
     return replace(model, coupling=coupling, noise=noise, offset=offset)

@@ -19,13 +19,12 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import n_modes, to_healpy
 from lusee_bayes.experiment.model import model_about, set_up, simulate, true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.instrument.beams.fields import HemisphereGrid, product_modes
+from lusee_bayes.instrument.beams.fields import HemisphereGrid, beam_scale, product_modes
 from lusee_bayes.instrument.beams.luseepy_files import read_response
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
 from lusee_bayes.instrument.beams.sampled import sampled_beams
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.systematics.context import Around
-from lusee_bayes.systematics.polarisation import beam_scale
 from lusee_bayes.testing import small_scenario
 
 LMAX, MHZ = 6, 25.0
