@@ -44,13 +44,7 @@ from lusee_bayes.core.checks import Described, is_traced, require_array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import gram_matrix, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling, as_coupling
-from lusee_bayes.linear.information import (
-    CONVERGENCE,
-    MAX_REFINEMENTS,
-    Information,
-    precision_root,
-    unfinished,
-)
+from lusee_bayes.linear import information as of_data
 from lusee_bayes.linear.normal_matrix import has_structure, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import Covariance, Factor, LowRankFactor, LowRankUpdate
@@ -269,14 +263,14 @@ class Solution(Described):
     data: DataVector
     posterior: Posterior
     factor: Factor
-    kept_information: Information | None = None
+    kept_information: of_data.Information | None = None
     excess: float = 0.0
 
     def description(self) -> tuple[str, ...]:
         return (*self.posterior.description(), "posterior, information, covariance, under(prior)")
 
     @cached_property
-    def information(self) -> Information:
+    def information(self) -> of_data.Information:
         """ln p(d | m) as a function of the sky; only its reference depends on the prior."""
         kept = self.kept_information
         if kept is None:
@@ -432,7 +426,7 @@ class FromInformation(Form):
             coupling = DenseCoupling(coupling.dense())
         if matrix is None:
             matrix = normal_matrix(coupling, model.noise, factor)
-        return cls(model, factor, coupling, matrix, precision_root(matrix, model.prior))
+        return cls(model, factor, coupling, matrix, of_data.precision_root(matrix, model.prior))
 
     @classmethod
     def beside(cls, solution: Solution, model: LinearGaussian) -> FromInformation:
@@ -461,7 +455,7 @@ class FromInformation(Form):
         another = np.abs(seen - before).max() > SAME * np.abs(seen).max()
         if another or largest * np.finfo(np.float64).eps > SEEN_ROUNDING:
             return cls.of(model)
-        return cls(host, factor, host.coupling, matrix, precision_root(matrix, host.prior))
+        return cls(host, factor, host.coupling, matrix, of_data.precision_root(matrix, host.prior))
 
     def condition(self, data: DataVector) -> Solution:
         data, prior = np.asarray(data), self.model.prior
@@ -471,13 +465,13 @@ class FromInformation(Form):
         posterior = information.posterior(prior, self.lower)
         return Solution(self.model, data, posterior, self.factor, information)
 
-    def _about(self, data: DataVector, sky: Modes) -> Information:
+    def _about(self, data: DataVector, sky: Modes) -> of_data.Information:
         """Information of the data, about a reference sky."""
         offset, n = self.model.offset, self.model.n_data
         white = self.factor.whiten(data - (0.0 if offset is None else offset) - self.coupling @ sky)
         vector = self.coupling.transpose_mv(np.asarray(self.factor.whiten_transpose(white)))
         scalars = map(np.asarray, (white @ white, self.factor.log_det(), float(n)))
-        return Information(self.matrix, np.asarray(vector), sky, *scalars)
+        return of_data.Information(self.matrix, np.asarray(vector), sky, *scalars)
 
 
 class Whitened(Form):
@@ -524,11 +518,11 @@ class Whitened(Form):
         require_array("the data", data, (self.model.n_data,))
         data = jnp.asarray(data)
         u, log_evidence, moved = _solve(self, data)
-        if not is_traced(moved) and not float(moved) <= CONVERGENCE:
+        if not is_traced(moved) and not float(moved) <= of_data.CONVERGENCE:
             raise InputError(
-                f"the posterior mean did not converge: after {MAX_REFINEMENTS} refinements it "
-                f"still changes by {float(moved):.2g} standard deviations (accepted: "
-                f"{CONVERGENCE:g}); the noise is too small for float64 arithmetic"
+                f"the posterior mean did not converge: after {of_data.MAX_REFINEMENTS} refinements "
+                f"it still changes by {float(moved):.2g} standard deviations (accepted: "
+                f"{of_data.CONVERGENCE:g}); the noise is too small for float64 arithmetic"
             )
         posterior = Posterior(self.model.prior, u, self.lower, self.basis, log_evidence, moved)
         parts = self.model, data, posterior, self.factor
@@ -625,7 +619,7 @@ def _solve(solver: Whitened, data: DataVector) -> tuple[Array, Array, Array]:
 
     first, _ = _newton(frozen, still, jnp.zeros(solver.whitened.shape[1]))
     start = (first, jnp.inf, jnp.inf, 0)
-    u, moved, _, _ = jax.lax.while_loop(lambda state: unfinished(*state[1:]), refine, start)
+    u, moved, _, _ = jax.lax.while_loop(lambda state: of_data.unfinished(*state[1:]), refine, start)
     fixed = replace(solver, lower=frozen.lower, basis=frozen.basis)
     u, _ = _newton(fixed, white, jax.lax.stop_gradient(u))
     misfit = white - solver.seen(u)

@@ -17,13 +17,8 @@ from lusee_bayes.core.arrays import Ells, Pixels
 from lusee_bayes.core.checks import Described, extent
 from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.core.trees import quantity
+from lusee_bayes.experiment import unknowns as reports
 from lusee_bayes.experiment.diagnosis import Diagnosis
-from lusee_bayes.experiment.unknowns import (
-    InstrumentPosterior,
-    PointingReport,
-    UnknownsReport,
-    in_both_units,
-)
 from lusee_bayes.judge import measures
 from lusee_bayes.judge.chi2 import HEADLINES, ChiSquare, Fit, Level
 from lusee_bayes.judge.coverage import Coverage
@@ -183,7 +178,7 @@ class ChannelData:
     doubts: tuple[str, ...] = ()
     judged: Judged | None = None
     details: Details | None = None
-    pointing: PointingReport | None = None
+    pointing: reports.PointingReport | None = None
     fluxes: pd.DataFrame | None = None
     diagnosis: Diagnosis | None = None
     digests: tuple[str, ...] = ()
@@ -196,7 +191,7 @@ class ChannelData:
         if pointing is not None and pointing.offsets is not None:
             pointing = pointing.given(table)
         if fluxes is not None:
-            fluxes = fluxes.assign(**in_both_units(table, self.frequency_mhz))
+            fluxes = fluxes.assign(**reports.in_both_units(table, self.frequency_mhz))
         return replace(self, pointing=pointing, fluxes=fluxes)
 
 
@@ -255,8 +250,8 @@ class ChannelResult(ChannelData, Described):
     chi2_model: float = np.nan
     refinement: float = np.nan
     coverage: tuple[Coverage, ...] = ()
-    unknowns: UnknownsReport | None = None
-    theta: InstrumentPosterior | None = None
+    unknowns: reports.UnknownsReport | None = None
+    theta: reports.InstrumentPosterior | None = None
     temperatures: RegionTemperatures
 
     def description(self) -> tuple[str, ...]:

@@ -27,15 +27,7 @@ from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.section import LARGEST, Positive, Section
-from lusee_bayes.instrument.beams.fields import (
-    AntennaFields,
-    HemisphereGrid,
-    Interpolation,
-    Pairs,
-    ProductBeams,
-    at_frequency,
-    stokes_beam,
-)
+from lusee_bayes.instrument.beams import fields as beam_fields
 from lusee_bayes.instrument.products import N_ANTENNAS
 
 Ohms = Complex[np.ndarray, "ports ports"]
@@ -176,7 +168,9 @@ class MeasuredReceiver(Receiver):
     load_ohm: Complex[np.ndarray, "frequencies ports ports"]
 
     def load(self, frequency_mhz: float) -> Ohms:
-        (ohm,) = at_frequency(self.path, self.frequencies_mhz, frequency_mhz, self.load_ohm)
+        (ohm,) = beam_fields.at_frequency(
+            self.path, self.frequencies_mhz, frequency_mhz, self.load_ohm
+        )
         return ohm
 
 
@@ -328,7 +322,9 @@ class BeamSource(ABC):
     has_fields = True
 
     @abstractmethod
-    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
+    def fields(
+        self, frequency_mhz: float, grid: beam_fields.HemisphereGrid
+    ) -> beam_fields.AntennaFields:
         """Return the field patterns of all ports on a grid.
 
         Parameters
@@ -347,7 +343,7 @@ class BeamSource(ABC):
             If the source has no beams at this frequency, or no fields of antennas.
         """
 
-    def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> Pairs:
+    def patterns(self, frequency_mhz: float, grid: beam_fields.HemisphereGrid) -> beam_fields.Pairs:
         """Return the response of every pair to Stokes I on a grid, in the unit of :meth:`fields`.
 
         Raises
@@ -355,10 +351,10 @@ class BeamSource(ABC):
         InputError
             If the source has no beams at this frequency.
         """
-        return stokes_beam(self.fields(frequency_mhz, grid))
+        return beam_fields.stokes_beam(self.fields(frequency_mhz, grid))
 
     @abstractmethod
-    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
+    def beams(self, frequency_mhz: float, lmax: int) -> beam_fields.ProductBeams:
         """Return the beams of all products.
 
         Parameters
@@ -417,7 +413,7 @@ class BeamSource(ABC):
         """
         return None
 
-    def interpolated(self, frequency_mhz: float) -> Interpolation | None:
+    def interpolated(self, frequency_mhz: float) -> beam_fields.Interpolation | None:
         """Return how beams are interpolated to this frequency; None if they are not.
 
         Raises
