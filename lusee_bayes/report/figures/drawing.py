@@ -12,7 +12,7 @@ figures; files and numbers are unsmoothed.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
@@ -250,6 +250,11 @@ def sky_figure(title: str, *panel: object, **options: object) -> Figure:
     figure, (axes,) = in_places((6.4, 3.0), **places)
     sky_panel(axes, title, *panel, shrink=0.8, pad=0.03, **options)
     return figure
+
+
+def sky_figures(panels: Mapping[str, tuple], altitude: Coarse) -> dict[str, Figure]:
+    """A :func:`sky_figure` of each panel, by its title."""
+    return {t: sky_figure(t, *panel, altitude=altitude) for t, panel in panels.items()}
 
 
 def view(pixels: Pixels) -> Float[np.ndarray, "height width"]:

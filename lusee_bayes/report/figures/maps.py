@@ -73,26 +73,20 @@ def draws(result: MapResult) -> Panels | None:
         f"draw {k}": (modes_to_map(sky, nside), norm)
         for k, sky in enumerate(channel.details.draws, 1)
     }
-    return _figures(panels, channel)
+    return drawing.sky_figures(panels, channel.highest_altitude)
 
 
 def sky_maps(result: MapResult) -> Panels:
     """The maps of one channel, or of some of the channels of a cube."""
     if result.single:
-        return _figures(channel_panels(result.channel), result.channel)
+        channel = result.channel
+        return drawing.sky_figures(channel_panels(channel), channel.highest_altitude)
     figures: Panels = {}
     for channel in (result.channels[k] for k in _few_of(len(result.channels), SHOWN)):
         panels, mhz = channel_panels(channel), f"{channel.frequency_mhz:g} MHz"
         posterior = {f"{mhz}: {t}": p for t, p in panels.items() if t.startswith("posterior")}
-        figures |= _figures(posterior, channel)
+        figures |= drawing.sky_figures(posterior, channel.highest_altitude)
     return figures
-
-
-def _figures(panels: Mapping[str, tuple], channel: ChannelResult) -> Panels:
-    return {
-        title: drawing.sky_figure(title, *panel, altitude=channel.highest_altitude)
-        for title, panel in panels.items()
-    }
 
 
 def spectra(result: MapResult) -> Figure | Panels:
@@ -270,7 +264,7 @@ def maps_of_runs(runs: Sequence[FinishedRun]) -> Panels:
             f"{run.name}: posterior mean": (mean, level),
             f"{run.name}: standard deviation": (run.channel.pixel_std, spread),
         }
-        figures |= _figures(panels, run.channel)
+        figures |= drawing.sky_figures(panels, run.channel.highest_altitude)
     return figures
 
 

@@ -97,18 +97,13 @@ def uncertainty(run: SampleResult) -> Figure | dict[str, Figure]:
     limit = np.percentile(np.abs(skewness), 99.0)
     skewed = Normalize(-limit, limit), drawing.DIVERGING, "fraction of the width"
     panels = {"mean of the draws": (maps["mean"], drawing.temperatures(maps["mean"]))}
-    for title, kelvin in {
-        "standard deviation": maps["std"],
-        "width of the 90 % interval": width,
-    }.items():
+    spreads = {"standard deviation": maps["std"], "width of the 90 % interval": width}
+    for title, kelvin in spreads.items():
         percent = 100.0 * kelvin / maps["mean"].mean()
         scale = Normalize(*np.percentile(percent, [0.5, 99.5]))
         panels[title] = percent, scale, drawing.SEQUENTIAL, "% of the mean sky"
     panels["asymmetry of the 90 % interval about the mean"] = skewness, *skewed
-    return {
-        title: drawing.sky_figure(title, *panel, altitude=run.highest_altitude)
-        for title, panel in panels.items()
-    }
+    return drawing.sky_figures(panels, run.highest_altitude)
 
 
 def traces(run: SampleResult) -> Figure:
