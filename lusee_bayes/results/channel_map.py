@@ -254,11 +254,11 @@ class Conditioned:
         experiment, inference, stages = self.experiment, self.from_data, stages or Stages()
         thorough = thorough or inference.size_of_fields > LARGER
         scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
-        fluxes, pointing, diagnosis, left, judged = None, None, None, None, None
-        judge, unused = self.judged.solution, inference.unused()
+        found: dict[str, Any] = {}
+        judge, unused, left = self.judged.solution, inference.unused(), None
         if experiment.setup.responses and scenario.sources.treatment != "ignored":
             with stages("fluxes"):
-                fluxes = flux_table(experiment, inference)
+                found["fluxes"] = flux_table(experiment, inference)
         with stages("diagnostics"):
             if not (alone or thorough):
                 given = judge.posterior, judge.chi2, inference.model.n_data, judge.matrix
@@ -267,16 +267,17 @@ class Conditioned:
             if alone or thorough or instrument.p < DOUBTFUL:
                 left = residuals(judge, data, unused, learned=learned is not None)
                 instrument = left.split.instrument
-            details = _details(self) if alone else None
+            found["details"] = _details(self) if alone else None
         bad = left is not None and left.level() == "does not fit"
         if bad or thorough:
             with stages("usual mistakes"):
-                diagnosis = diagnose(experiment.setup, inference, left)
+                found["diagnosis"] = diagnose(experiment.setup, inference, left)
         if left is not None:
-            judged = self._judged(left, truncated=diagnosis is not None and diagnosis.is_truncation)
+            truncated = "diagnosis" in found and found["diagnosis"].is_truncation
+            found["judged"] = self._judged(left, truncated=truncated)
         if scenario.noise.pointing is not None or bad:
             with stages("clock and pointing"):
-                pointing = pointing_report(experiment, inference)
+                found["pointing"] = pointing_report(experiment, inference)
         doubtful = list(doubts(experiment, inference))
         if left is not None:
             doubtful += about_sky_above(experiment.setup)
@@ -284,9 +285,9 @@ class Conditioned:
             with stages("first order"):
                 doubtful += reach(experiment, inference)
         fitting = experiment.fitting
-        altitude, departure = measures.highest_altitude(data.observation, scenario.map_nside), None
+        altitude = measures.highest_altitude(data.observation, scenario.map_nside)
         if not joint:
-            departure = Departure.of(altitude, self.posterior, *self._shared())
+            found["departure"] = Departure.of(altitude, self.posterior, *self._shared())
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
             taken=taken(data.observation),
@@ -308,14 +309,9 @@ class Conditioned:
             log_evidence_learned=None if learned is None else learned.log_evidence,
             beam_rms_difference=beam_rms_difference(experiment.setup),
             doubts=tuple(doubtful),
-            judged=judged,
-            details=details,
-            pointing=pointing,
-            fluxes=fluxes,
-            diagnosis=diagnosis,
             digests=self.digests,
             information=self.information if scenario.output.information else None,
-            departure=departure,
+            **found,
         )
 
     def _shared(self) -> tuple[WithSky, Columns]:
