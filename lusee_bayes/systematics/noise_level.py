@@ -82,14 +82,10 @@ class NoiseLevel(Scale):
 
 def radiometer_about(setup: Setup) -> NoiseAbout:
     """Visibilities that set the level of the radiometer noise."""
-    chosen = setup.scenario.noise.radiometer.temperature
-    if chosen is not None or not setup.measured:
-        return chosen or "model"
-    return "measured" if setup.noise_is_seen and common_bias(setup) < HARMLESS_BIAS else "posterior"
-
-
-def common_bias(setup: Setup) -> float:
-    """How far noise in measured visibilities moves a common amplitude, in standard deviations."""
-    n_antennas, factor = setup.beam_source.n_ports, setup.scenario.noise.radiometer.factor
-    ratio = factor * setup.observation.n_times / np.median(setup.n_averaged)
-    return float(4.0 * n_antennas * np.sqrt(ratio))
+    section = setup.scenario.noise.radiometer
+    if section.temperature is not None or not setup.measured:
+        return section.temperature or "model"
+    # how far noise in measured visibilities moves a common amplitude, in standard deviations
+    ratio = section.factor * setup.observation.n_times / np.median(setup.n_averaged)
+    harmless = 4.0 * setup.beam_source.n_ports * np.sqrt(ratio) < HARMLESS_BIAS
+    return "measured" if setup.noise_is_seen and harmless else "posterior"
