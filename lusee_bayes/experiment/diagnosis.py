@@ -231,9 +231,8 @@ class UnderAnySky:
         power = np.asarray(prior.variance() + prior.colour(prior.white_mean) ** 2)
         autos = auto_indices(setup.beam_source.n_ports)
         modelled = float(np.median(np.asarray(setup.signal)[autos]))
-        brighter = (
-            np.nanmedian(np.append(np.asarray(around.data.grid())[autos], modelled)) / modelled
-        )
+        seen = np.asarray(around.data.grid())[autos]
+        brighter = np.nanmedian(np.append(seen, modelled)) / modelled
         return cls(setup, around, model, mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2)
 
     def wide(self, coupling: Coupling) -> tuple[ChiSquare, Solution]:

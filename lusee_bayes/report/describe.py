@@ -153,9 +153,8 @@ def describe_folder(folder: Path) -> list[str]:
         lines += [f"command: {facts.command}"] if facts.command else []
     for name in VERDICTS:
         if name in manifest["files"]:
-            lines.append(
-                str(read_model(folder / name, dict, "the figures of a run").get("verdict"))
-            )
+            figures = read_model(folder / name, dict, "the figures of a run")
+            lines.append(str(figures.get("verdict")))
     return [*lines, f"files: {', '.join(sorted(manifest['files']))}"]
 
 

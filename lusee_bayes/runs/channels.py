@@ -300,12 +300,11 @@ def solve_components(
             skies = spectral.positive_skies(frequencies, scenario.lmax)
         silent = replace(channels, stages=Stages())
         coarse = spectral.lmax_of_fields(min(scenario.lmax, positive_joint.COARSE_LMAX))
-        with stages.progress(
-            "laws of the fields", positive_joint.MAX_ROUNDS, rounds=True
-        ) as report:
+        in_rounds = {"total": positive_joint.MAX_ROUNDS, "rounds": True}
+        with stages.progress("laws of the fields", **in_rounds) as report:
             alone = replace(silent, tied=None)
             laws = positive_joint.learn_laws(skies, alone, lmax_fields=coarse, report=report)
-        with stages.progress("positive skies", positive_joint.MAX_ROUNDS, rounds=True) as report:
+        with stages.progress("positive skies", **in_rounds) as report:
             mode = positive_joint.find_joint_mode(skies, laws, silent, white, report=report)
         prior, posterior, chi2, moved = mode.prior, mode.posterior, mode.energy, mode.moved
     else:

@@ -122,9 +122,8 @@ def _write_maps(result: MapResult, folder: Path) -> None:
         draws = channel.draws[:MOST_DRAWS] if len(channel.draws) else channel.details.draws
         skies = {f"draw_{k}": modes_to_map(sky, channel.nside) for k, sky in enumerate(draws, 1)}
         observed = channel.highest_altitude >= 0
-        finished_runs.write_map(
-            folder / "map.fits", channel.maps() | skies, observed, result.scenario
-        )
+        shown = channel.maps() | skies
+        finished_runs.write_map(folder / "map.fits", shown, observed, result.scenario)
     else:
         finished_runs.write_cubes(folder, result.maps(), result.frequencies_mhz, result.scenario)
 

@@ -96,9 +96,8 @@ def turned(family: str) -> bool:
 def unnoticed(setup: Setup, inference: Inference) -> str:
     """Errors that the residual chi^2 would not reveal, sorted by their effect on the map."""
     spots = blind_spots(setup, inference, np.asarray(setup.sky.modes))
-    shown = sorted(
-        (s for s in spots if s.shown > NOTHING * s.bias**2), key=lambda s: -s.unnoticed[1]
-    )
+    shown = [s for s in spots if s.shown > NOTHING * s.bias**2]
+    shown.sort(key=lambda s: -s.unnoticed[1])
     return ", ".join(f"{s.name} {s.unnoticed[0]:.2g}{s.unit} ({s.unnoticed[1]:.2g})" for s in shown)
 
 
