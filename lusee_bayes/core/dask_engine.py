@@ -29,11 +29,9 @@ import dask
 import distributed
 from distributed.scheduler import NoWorkerError
 
-from lusee_bayes.core import engine
-from lusee_bayes.core.arrays import use_compilation_cache
+from lusee_bayes.core import arrays, engine, files
 from lusee_bayes.core.engine import Merge, R, T, Tasks
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.files import scratch_folder
 from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
 from lusee_bayes.core.version import __version__
 
@@ -103,7 +101,7 @@ class DaskEngine(engine.Engine):
         """
         if self._folder is None:
             raise RuntimeError("the engine has no folder: call work_in first")
-        place, numbers = scratch_folder(self._folder), {}
+        place, numbers = files.scratch_folder(self._folder), {}
         job = place / "job.pickle"
 
         def note(event: tuple[float, Any]) -> None:
@@ -176,7 +174,7 @@ def _read_job(path: Path) -> tuple[Callable[..., Any], Any, Any]:
     if os.getpid() != command:
         # configure this worker like the process of a command
         gc.set_threshold(100_000, 20, 100)
-        use_compilation_cache()
+        arrays.use_compilation_cache()
         # otherwise xarray asks the scheduler for a lock per file, through another client
         dask.config.set(scheduler="threads")
     return tuple(job)

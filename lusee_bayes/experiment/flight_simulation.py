@@ -20,12 +20,11 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import gain_table_of, per_kelvin_of
 from lusee_bayes.experiment.model import set_up, true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.flight import synthesis
+from lusee_bayes.flight import session_files, synthesis
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
 from lusee_bayes.flight.gain_model import Errors, GainModel, draw_gains
 from lusee_bayes.flight.recipe import FlightSection, FlightSimulatedSection
 from lusee_bayes.flight.session import ADC_HIGH, ADC_LOW, FRAME_S, PORTS, BinOrigin, channel_mhz
-from lusee_bayes.flight.session_files import SessionRows
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout, ports, to_matrix, to_real
 from lusee_bayes.instrument.times import Windows
@@ -112,7 +111,7 @@ class FlightSimulation:
         edges = np.flatnonzero(np.diff(number, prepend=-1.0, append=np.inf)).tolist()
         return tuple(slice(start, end) for start, end in pairwise(edges))
 
-    def rows(self, session: slice) -> SessionRows:
+    def rows(self, session: slice) -> session_files.SessionRows:
         """Return the metadata of a session's spectra.
 
         Parameters
@@ -126,7 +125,7 @@ class FlightSimulation:
         peak = np.rint(ADC_PEAK * rms).astype(np.int64)
         times = self.observation.times[session]
         days = (times.jd1 - self.clock.jd1) + (times.jd2 - self.clock.jd2)
-        return SessionRows(
+        return session_files.SessionRows(
             raw_s=self.clock.raw_s + days * DAY_S,
             navgf=np.full(n, self.section.navgf, dtype=np.int64),
             navg_shift=np.full(n, self.navg_shift, dtype=np.int64),

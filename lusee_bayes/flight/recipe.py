@@ -16,17 +16,15 @@ from astropy.time import Time
 from jaxtyping import Int
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Times
+from lusee_bayes.core import arrays, reading
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import LARGEST, Angle, Frequency, Positive, Section, requires
 from lusee_bayes.flight.bands import Taper
 from lusee_bayes.flight.clock import Clock, clock_of
 from lusee_bayes.flight.gain_model import GainModel
 from lusee_bayes.flight.session import BinOrigin, Session
-from lusee_bayes.instrument.averaging import bins_of
+from lusee_bayes.instrument import averaging, products
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import CONVENTIONS
 from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, contiguous, later, utc_of, utc_times
 
 Share = Annotated[float, Field(ge=0, le=0.5)]
@@ -187,11 +185,11 @@ class FlightSection(Section):
     @property
     def sign(self) -> int:
         """Sign that converts the spectrometer's imaginary parts to those of <s_i conj(s_j)>."""
-        return int(CONVENTIONS[self.convention])
+        return int(products.CONVENTIONS[self.convention])
 
-    def angles_at(self, times: Time) -> Times:
+    def angles_at(self, times: Time) -> arrays.Times:
         """Return the turntable's angle at these times; InputError if ``turns`` has other keys."""
-        with naming("flight.turns"):
+        with reading.naming("flight.turns"):
             starts = [float(utc_times(start).jd[0]) for start in self.turns]
         angles = [x for _, x in sorted(zip(starts, self.turns.values(), strict=True))]
         number = np.searchsorted(np.sort(starts), times.jd, side="right")
@@ -320,12 +318,12 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     states = np.column_stack([session, angle, np.concatenate(settings)])
     changes = np.append(True, (states[1:] != states[:-1]).any(axis=1))
     state = np.cumsum(changes) - 1
-    with naming(", ".join(str(s.path) for s in ordered)):
+    with reading.naming(", ".join(str(s.path) for s in ordered)):
         angles, longest = tuple(angle[changes].tolist()), float(window.max())
         observation = Observation(lon, lat, times, state, angles, longest, windows=windows)
     bin_of = np.arange(len(state))
     if recipe.average_s is not None:
-        bin_of = bins_of(observation, recipe.average_s)
+        bin_of = averaging.bins_of(observation, recipe.average_s)
     row = np.concatenate([np.arange(s.n_rows) for s in ordered])
     return Timeline(ordered, observation, session, row, bin_of)
 

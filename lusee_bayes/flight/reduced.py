@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 
-from lusee_bayes.core import formats
+from lusee_bayes.core import formats, reading
 from lusee_bayes.core.checks import Described, counted, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.reading import naming
 from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
 from lusee_bayes.flight.gain_model import COUNTS, LEAD, LETTERS, PLACES, Curves
 from lusee_bayes.flight.session import FIRST_PORT, NO_LEVEL, PORTS, SECOND_PORT
@@ -362,7 +361,7 @@ def read_reduced(path: str | Path) -> Reduced:
         read = from_tree(Reduced, tree, str(path))
     if tuple(read.product) != labels():
         raise InputError(f"{path} does not have the products {', '.join(labels())}")
-    with naming(path):
+    with reading.naming(path):
         require_shape("level", read.level, (None, PORTS))
         require_shape("curves", read.curves.gain, (*LEAD, None))
         if read.component_std is not None:

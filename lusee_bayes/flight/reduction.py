@@ -18,14 +18,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from lusee_bayes.core import engine, progress, reading
 from lusee_bayes.core.arrays import Rows
-from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.lazy import xarray
-from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import naming
-from lusee_bayes.flight import flags, reduced, session
+from lusee_bayes.flight import flags, gain_model, reduced, session
 from lusee_bayes.flight.bands import ChannelBand, shared_noise
-from lusee_bayes.flight.gain_model import NANO2, gain_curves
 from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
 from lusee_bayes.instrument.averaging import by_the_rule
 from lusee_bayes.instrument.products import labels
@@ -41,7 +38,7 @@ Parts = dict[str, np.ndarray]
 
 
 def reduce_sessions(
-    sessions: Sequence[session.Session], recipe: Recipe, stages: Stages | None = None
+    sessions: Sequence[session.Session], recipe: Recipe, stages: progress.Stages | None = None
 ) -> reduced.Reduced:
     """Reduce sessions.
 
@@ -58,7 +55,7 @@ def reduce_sessions(
         If clocks, sites or times are unknown or contradict each other, a session lacks telemetry,
         or bands have too few channels.
     """
-    stages, line = stages or Stages(), timeline(sessions, recipe)
+    stages, line = stages or progress.Stages(), timeline(sessions, recipe)
     level = np.concatenate([s.level for s in line.sessions])
     first = np.searchsorted(line.bin_of, np.arange(line.bin_of[-1] + 1))
     live_s, times = line.observation.live_s, line.observation.times
@@ -73,11 +70,11 @@ def reduce_sessions(
         for slabs in pieces:
             piece = slice(slabs[0].start, slabs[-1].stop)
             calibrators = (_slab(line, recipe, rows.start, next(counts)) for rows in slabs)
-            parts = [in_threads(calibrate, numbers) for calibrate in calibrators]
+            parts = [engine.in_threads(calibrate, numbers) for calibrate in calibrators]
             spectra = [_joined(band) for band in zip(*parts, strict=True)]
             seconds = seconds_from(times[piece.start], times[piece])
             of_piece = seconds, live_s[piece], line.bin_of[piece], recipe.section.false_alarm
-            averages.append(in_threads(partial(_finish, *of_piece), spectra))
+            averages.append(engine.in_threads(partial(_finish, *of_piece), spectra))
             done(piece.stop)
     bands = [_joined(band) for band in zip(*averages, strict=True)]
     whole = {name: np.stack([band[name] for band in bands]) for name in bands[0]}
@@ -101,7 +98,7 @@ def reduce_sessions(
         level=level[first],
         component_std=recipe.table.component_std,
         gain_std=recipe.section.gain_std,
-        curves=gain_curves(recipe.table, recipe.section.gain_std, level, telemetry),
+        curves=gain_model.gain_curves(recipe.table, recipe.section.gain_std, level, telemetry),
         sessions=tuple(_said_of(s, recipe) for s in line.sessions),
         recipe=recipe.words(),
         curvature=np.abs(bend).max("port").values,
@@ -196,7 +193,7 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
     telemetry = {name: values[rows_read] for name, values in source.telemetry.items()}
     # 1, q_1 and q_2 of every port; NaN if the port has no level
     strengths = np.full((len(counts), session.PORTS, 3), np.nan)
-    with naming(source.path):
+    with reading.naming(source.path):
         for port, level in enumerate(levels):
             if level != session.NO_LEVEL:
                 strengths[:, port, 0] = 1.0
@@ -208,7 +205,7 @@ def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Cal
         at = slice(band.first, band.last)
         basis = gains[:, :, at]
         gain = np.einsum("rpc,pck->rpk", strengths, basis)
-        factor = NANO2 * averaging.stride / averaging.members
+        factor = gain_model.NANO2 * averaging.stride / averaging.members
         with np.errstate(invalid="ignore", divide="ignore"):
             root = np.sqrt(np.where(gain > 0.0, gain, np.nan))
             # what is sent is a sum over the accepted frames, divided by the number of all frames

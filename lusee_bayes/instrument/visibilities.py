@@ -22,14 +22,12 @@ import xarray as xr
 from astropy.time import Time
 from jaxtyping import Float, Int
 
-from lusee_bayes.core import checks, formats
+from lusee_bayes.core import checks, files, formats, reading
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import as_dataset, read_netcdf, write_netcdf
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
-from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.instrument.beams.source import MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation, numbers_of_times, runs_of, site_of
 from lusee_bayes.instrument.products import N_ANTENNAS, DataLayout, labels_of, real_products
@@ -413,9 +411,9 @@ class Visibilities(checks.Described):
         -------
         Path
         """
-        with replacing(path) as partial:
+        with files.replacing(path) as partial:
             write_netcdf(self.to_dataset().assign_attrs(attrs or {}), partial)
-        return user_path(path)
+        return files.user_path(path)
 
 
 LAYOUT = Layout(
@@ -469,7 +467,7 @@ def read_visibilities(path: str | Path) -> Visibilities:
         If the file is missing or of another kind, contains NaN that is not flagged, or only flagged
         samples.
     """
-    require_file(path, "data", HINT)
+    reading.require_file(path, "data", HINT)
     content = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
     arrays, said = content.arrays, content.values
     given, expected = tuple(map(str, arrays["product"])), labels_of(len(arrays["product"]))
@@ -478,7 +476,7 @@ def read_visibilities(path: str | Path) -> Visibilities:
     flags = arrays["flag"]
     values = np.where(flags, 0.0, arrays["visibility"])
     checks.require_finite(f"{path}: visibility (where not flagged)", values)
-    with naming(path):
+    with reading.naming(path):
         layout = DataLayout.from_flags(flags)
         times, windows = read_windows(content, _utc_of_jd(content))
         says_window = windows is not None or said.get("window") == "instant"

@@ -11,14 +11,12 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from lusee_bayes.core import formats
+from lusee_bayes.core import formats, reading
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.version import versions
+from lusee_bayes.experiment import model, sky_sections
 from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.experiment.sky_sections import FileSkySection
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
 from lusee_bayes.paper.claims import TABLE, Cases, cross
 from lusee_bayes.results.channel_map import conditioned
@@ -43,7 +41,7 @@ def paper_scenarios(
     for name, scenario in scenarios.items() if files else ():
         # the file nearest in log frequency, scaled to the scenario's
         nearest = min(files, key=lambda f: abs(np.log(f / scenario.frequency_mhz)))
-        sky = FileSkySection(file=str(files[nearest]), file_frequency_mhz=nearest)
+        sky = sky_sections.FileSkySection(file=str(files[nearest]), file_frequency_mhz=nearest)
         scenarios[name] = scenario.model_copy(update={"sky": sky})
     return scenarios
 
@@ -53,7 +51,7 @@ def sky_frequency_mhz(path: str | Path) -> float:
 
     InputError if the file is missing or its name has no frequency.
     """
-    path = require_file(path, "sky map")
+    path = reading.require_file(path, "sky map")
     match = re.search(r"exp(\d+(?:\.\d+)?)MHz", Path(path).name)
     if match is None or float(match[1]) == 0.0:
         raise InputError(
@@ -80,7 +78,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
     setup, data, made = experiment.setup, experiment.data, conditioned(experiment)
     channel = made.result(made.channel_data(alone=False))
     spectra, maps = channel.spectra(), channel.maps()
-    variances = data.layout.scatter(radiometer(setup).diagonal())
+    variances = data.layout.scatter(model.radiometer(setup).diagonal())
     grid = HemisphereGrid.gauss_legendre(*BEAM_NODES)
     beams = stokes_beam(setup.beam_source.fields(scenario.frequency_mhz, grid))[0, [0, 2, 1]]
     rms = channel.beam_rms_difference

@@ -18,8 +18,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
-from lusee_bayes.core.checks import counted
-from lusee_bayes.core.files import require_files
+from lusee_bayes.core import checks, files
 from lusee_bayes.core.reading import read_text
 from lusee_bayes.core.version import printable
 from lusee_bayes.judge.chi2 import HEADLINES, RULE, probability
@@ -71,7 +70,7 @@ def pictures(folder: Path, name: str) -> list[str]:
 
 def picture(folder: Path, name: str) -> str:
     """A picture of a run as a data URL. InputError if the run has none."""
-    require_files(folder, (f"figures/{name}.png",), "map")
+    files.require_files(folder, (f"figures/{name}.png",), "map")
     data = (folder / "figures" / f"{name}.png").read_bytes()
     return f"data:image/png;base64,{base64.b64encode(data).decode()}"
 
@@ -121,7 +120,7 @@ ENVIRONMENT = Environment(
     lstrip_blocks=True,
 )
 ENVIRONMENT.filters |= {"number": formatted, "probability": p_value}
-ENVIRONMENT.globals |= {"asset": asset, "counted": counted, "CRITERIA": CRITERIA}
+ENVIRONMENT.globals |= {"asset": asset, "counted": checks.counted, "CRITERIA": CRITERIA}
 ENVIRONMENT.globals |= {"RULE": RULE, "HEADLINES": HEADLINES}
 
 

@@ -21,11 +21,9 @@ from astropy.io import fits
 from jaxtyping import Bool, Float
 from pydantic import BaseModel
 
-from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import Draws, Pixels
+from lusee_bayes.core import arrays, formats, harmonics
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover, require_files, user_path
-from lusee_bayes.core.harmonics import mode_numbers, n_modes
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import read_model, require_file
 from lusee_bayes.core.trees import from_tree, opened_tree, to_tree
@@ -70,7 +68,7 @@ def text_hash(text: str) -> str:
 
 def write_map(
     path: Path,
-    maps: Mapping[str, Pixels],
+    maps: Mapping[str, arrays.Pixels],
     observed: Bool[np.ndarray, " pixels"],
     scenario: Scenario,
 ) -> None:
@@ -144,7 +142,7 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
     ``constant_data`` follow ArviZ; ``information``, if requested, has a group for each frequency.
     """
     scenario, joint, channels = result.scenario, result.joint, result.channels
-    ell, m = mode_numbers(scenario.lmax)
+    ell, m = harmonics.mode_numbers(scenario.lmax)
     skies = {name: result.stacked(name) for name in ("mean", "std", "prior_std", "truth")}
     skies["independent_mean"] = result.stacked("independent")
     on_modes, kelvin = ("frequency", "mode"), {"units": "K"}
@@ -217,7 +215,7 @@ class SavedInformation:
         return information + self.information
 
 
-def read_draws(folder: str | Path, frequency_mhz: float | None = None) -> Draws:
+def read_draws(folder: str | Path, frequency_mhz: float | None = None) -> arrays.Draws:
     """Read the posterior draws of a finished map (``lusee-bayes map --draws N``).
 
     Parameters
@@ -277,7 +275,7 @@ def read_information(path: Path, channel: Scenario) -> SavedInformation:
                 "its frequencies, or map without --add"
             )
         saved = from_tree(SavedInformation, kept.children[name], str(path))
-    if saved.information.n_modes != n_modes(channel.lmax):
+    if saved.information.n_modes != harmonics.n_modes(channel.lmax):
         lmax = round(np.sqrt(saved.information.n_modes)) - 1
         raise InputError(
             f"{path} has lmax = {lmax}, the scenario lmax = {channel.lmax}; use --set lmax={lmax}"

@@ -23,11 +23,9 @@ from numpy.polynomial.chebyshev import chebvander
 from scipy.optimize import curve_fit
 from scipy.stats import foldnorm
 
-from lusee_bayes.core.arrays import Square, Vector
+from lusee_bayes.core import arrays, linalg, reading
 from lusee_bayes.core.errors import InputError, refusing
 from lusee_bayes.core.layouts import Layout, Variable
-from lusee_bayes.core.linalg import checked_cholesky
-from lusee_bayes.core.reading import read_table
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.results.sky_spectrum import OBSERVED, Frequencies, SkySpectrum
@@ -138,12 +136,12 @@ def signal_limit(
         )
     if not (np.isfinite(y) & (y > 0.0)).all():
         raise InputError(f"the {region} has temperatures that are not positive")
-    checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
+    linalg.checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
 
     options = {"x_scale": "jac", "method": "trf", "full_output": True}
     options |= dict.fromkeys(("ftol", "xtol", "gtol"), SETTLED)
 
-    def fitted(order: int) -> tuple[float, Vector, Float[np.ndarray, "frequency columns"]]:
+    def fitted(order: int) -> tuple[float, arrays.Vector, Float[np.ndarray, "frequency columns"]]:
         """Amplitude, white residuals, and derivatives by all parameters, for a degree."""
         smooth = chebvander(x, order)
 
@@ -163,7 +161,7 @@ def signal_limit(
     amplitude, off, columns = fitted(order)
     change = fitted(order + 1)[0] - amplitude if len(f) > order + 3 else 0.0
 
-    def error_under(covariance: Square, change: float = change) -> float:
+    def error_under(covariance: arrays.Square, change: float = change) -> float:
         normal = columns.T @ np.linalg.solve(covariance, columns)
         alike = f"{name}: a smooth spectrum of degree {order} looks the same; raise --order"
         with refusing(alike, np.linalg.LinAlgError):
@@ -182,7 +180,7 @@ def signal_limit(
     return SignalLimit(name, region, amplitude, std, limit, fit, without)
 
 
-def named_template(text: str) -> tuple[str, Callable[[Frequencies], Vector]]:
+def named_template(text: str) -> tuple[str, Callable[[Frequencies], arrays.Vector]]:
     """A template from its text on the command line, with a name.
 
     Parameters
@@ -213,7 +211,7 @@ def named_template(text: str) -> tuple[str, Callable[[Frequencies], Vector]]:
         raise InputError(
             f"no template '{text}'; give trough:MHZ:WIDTH, excess, constant or a CSV file"
         )
-    table = read_table(Path(text), TABLE)
+    table = reading.read_table(Path(text), TABLE)
     mhz, kelvin = table["frequency_mhz"], table["temperature_k"]
     shape = kelvin / (np.abs(kelvin).max() or 1.0)
     return f"{Path(text).stem}, at its peak", lambda f: np.interp(f, mhz, shape, np.nan, np.nan)

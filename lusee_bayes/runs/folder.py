@@ -20,11 +20,8 @@ from pandas import DataFrame
 from pydantic import BaseModel
 from xarray import Dataset, DataTree
 
-from lusee_bayes.core import files
-from lusee_bayes.core.arrays import use_compilation_cache
+from lusee_bayes.core import arrays, files, formats, progress
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.formats import write_netcdf
-from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.data_files import Data, digest_of, files_of, names_of_data
 from lusee_bayes.experiment.scenario import Scenario
@@ -199,7 +196,7 @@ class Output:
     @classmethod
     def netcdf(cls, name: str, content: Callable[[Any], Dataset | DataTree]) -> Output:
         """A netCDF file from a dataset or a data tree."""
-        return cls(lambda run, folder: write_netcdf(content(run), folder / name))
+        return cls(lambda run, folder: formats.write_netcdf(content(run), folder / name))
 
 
 SCENARIO = Output.text("scenario.yaml", lambda result: result.scenario.to_yaml())
@@ -253,7 +250,7 @@ class RunFolder:
     origin: Origin
 
     def write(
-        self, result: Result, stages: Stages, provenance: Provenance | None = None
+        self, result: Result, stages: progress.Stages, provenance: Provenance | None = None
     ) -> RunOutcome[Result]:
         """Draw all figures and write all files of a run, in one transaction.
 
@@ -347,7 +344,7 @@ def run_folder(
             else:
                 files.require_apart(folder, read)
             before = _written_at(folder)
-            use_compilation_cache()
+            arrays.use_compilation_cache()
             try:
                 yield RunFolder(folder, kind, origin)
             except KeyboardInterrupt as interrupt:

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import xarray as xr
 
+from lusee_bayes.core import files, formats, progress
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
-from lusee_bayes.core.files import replacing
-from lusee_bayes.core.formats import write_netcdf
-from lusee_bayes.core.progress import Stages
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios
 from lusee_bayes.paper.claims import Cases, claim_table
 from lusee_bayes.paper.figures import FIGURES
@@ -26,7 +24,7 @@ def run_paper(
     skies: Sequence[str | Path] = (),
     engine: Engine | None = None,
     replace: bool = False,
-    stages: Stages | None = None,
+    stages: progress.Stages | None = None,
 ) -> RunOutcome[Cases]:
     """Compute the paper's missing cases, then draw the figures and test the claims.
 
@@ -51,7 +49,7 @@ def run_paper(
     InputError
         For skies without a frequency in their names, and for invalid overrides.
     """
-    engine, stages = engine or ThisProcess(), stages or Stages()
+    engine, stages = engine or ThisProcess(), stages or progress.Stages()
     scenarios = paper_scenarios(overrides, skies)
     with run_folder(folder, PAPER, replace=replace) as run:
         engine.work_in(run.path)
@@ -63,8 +61,8 @@ def run_paper(
             for path in (home / place / f"{name}.nc" for place in (CASES, UNFINISHED)):
                 if is_case(path, scenarios[name]):
                     return path
-            with replacing(path) as partial:
-                write_netcdf(compute_case(scenarios[name]), partial)
+            with files.replacing(path) as partial:
+                formats.write_netcdf(compute_case(scenarios[name]), partial)
             return path
 
         names = list(scenarios)
@@ -76,7 +74,7 @@ def run_paper(
 def _write_cases(cases: Cases, folder: Path) -> None:
     (folder / CASES).mkdir()
     for name, case in cases.items():
-        write_netcdf(case, folder / CASES / f"{name}.nc")
+        formats.write_netcdf(case, folder / CASES / f"{name}.nc")
 
 
 # contents of the folder of the paper's run; a new file is one line here

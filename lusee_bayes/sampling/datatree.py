@@ -11,15 +11,13 @@ import numpy as np
 import xarray as xr
 from numpyro.infer import Predictive
 
-from lusee_bayes.core import formats
-from lusee_bayes.core.harmonics import lmax_of, mode_numbers
+from lusee_bayes.core import formats, harmonics
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import reading
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.sampling import programs
-from lusee_bayes.sampling.hmc import Chains
+from lusee_bayes.sampling import hmc, programs
 from lusee_bayes.systematics.systematic import SKY
 
 # required contents of a file of samples
@@ -43,7 +41,7 @@ GROUPS = Layout(
 
 
 def to_datatree(
-    chains: Chains,
+    chains: hmc.Chains,
     program: programs.Program,
     model: LinearGaussian,
     posterior: Posterior,
@@ -133,7 +131,7 @@ def to_datatree(
 
 def _with_coordinates(tree: xr.DataTree, model: LinearGaussian, data: Visibilities) -> xr.DataTree:
     """Add ell and m of every mode, product and time of every sample, and units."""
-    ell, m = mode_numbers(lmax_of(model.prior.size))
+    ell, m = harmonics.mode_numbers(harmonics.lmax_of(model.prior.size))
     coordinates = {
         "ell": ("mode", ell),
         "m": ("mode", m),

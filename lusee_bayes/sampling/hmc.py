@@ -33,16 +33,14 @@ from numpyro.infer.hmc_util import HMCAdaptState
 from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import constrain_fn
 
+from lusee_bayes.core import checks, files
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import is_traced, require_positive
 from lusee_bayes.core.errors import InputError, require_known
-from lusee_bayes.core.files import replacing
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.reading import read_model, reading
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.sampling import programs
-from lusee_bayes.sampling.distributions import Marginal
+from lusee_bayes.sampling import distributions, programs
 from lusee_bayes.systematics.systematic import SKY, Chart
 
 # statistics of every draw, by their ArviZ names
@@ -113,7 +111,7 @@ class Whitening(eqx.Module):
 
     def __check_init__(self):
         n = sum(math.prod(shape) for _, shape in self.sites)
-        if not is_traced(self.mean) and self.mean.shape != (n,):
+        if not checks.is_traced(self.mean) and self.mean.shape != (n,):
             raise InputError(f"the sites have {n} values, the mean {self.mean.shape[0]}")
 
     @classmethod
@@ -277,7 +275,7 @@ class Checkpoints:
         described = json.loads(json.dumps(identity))
         marker, paths = self.folder / IDENTITY, self._paths()
         if not paths:
-            with replacing(marker) as scratch:
+            with files.replacing(marker) as scratch:
                 scratch.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
             return
         if not marker.exists():
@@ -327,7 +325,7 @@ class Checkpoints:
         arrays = {f"state:{i:03d}": leaf for i, leaf in enumerate(chunk.state)}
         arrays |= {f"draws:{name}": values for name, values in chunk.draws.items()}
         path = self.folder / f"chunk-{chunk.iteration:08d}.npz"
-        with replacing(path) as scratch, scratch.open("wb") as file:
+        with files.replacing(path) as scratch, scratch.open("wb") as file:
             np.savez(file, **arrays)
             file.flush()
             os.fsync(file.fileno())
@@ -389,7 +387,7 @@ class CrankNicolson(MCMCKernel):
             if site["type"] != "sample":
                 continue
             fn, value = site["fn"], site["value"]
-            if isinstance(fn, Marginal) and any(fn.model is one for one in to_draw):
+            if isinstance(fn, distributions.Marginal) and any(fn.model is one for one in to_draw):
                 posterior = fn.model.condition(value).posterior
                 key, subkey = jax.random.split(key)
                 drawn[name.removesuffix(programs.DATA) + SKY] = posterior.sample(subkey)
@@ -493,7 +491,7 @@ class Sampler:
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if not 0 < self.target_accept < 1:
             raise InputError(f"target_accept must lie in 0..1, got {self.target_accept}")
-        require_positive("trajectory", self.trajectory)
+        checks.require_positive("trajectory", self.trajectory)
         require_known("unknown algorithm", self.algorithm or ALGORITHMS[0], ALGORITHMS)
 
     def identity(self) -> dict[str, object]:

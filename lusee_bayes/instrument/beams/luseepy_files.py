@@ -42,11 +42,9 @@ from scipy.constants import Boltzmann, physical_constants, speed_of_light
 from scipy.fft import dct, dst
 from scipy.special import roots_legendre
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core import arrays, formats, harmonics
 from lusee_bayes.core.checks import Described, counted, extent
 from lusee_bayes.core.errors import InputError, require_known
-from lusee_bayes.core.formats import read_fits
-from lusee_bayes.core.harmonics import mode_numbers, polar_functions
 from lusee_bayes.core.layouts import UNSTATED, Attribute, Layout, Variable
 from lusee_bayes.instrument.beams.fields import (
     Angles,
@@ -137,8 +135,8 @@ class BandLimitedGrid(HemisphereGrid):
         # exact: the product has degree 2 n + lmax in theta
         nodes, weights = roots_legendre(4 * n + lmax)
         fine = np.arccos(nodes)
-        polar = polar_functions(fine, lmax) * weights[:, None]
-        _, m = mode_numbers(lmax)
+        polar = harmonics.polar_functions(fine, lmax) * weights[:, None]
+        _, m = harmonics.mode_numbers(lmax)
         summed = np.empty((n, polar.shape[1]))
         for parity in (0, 1):
             same = m % 2 == parity
@@ -354,7 +352,7 @@ class PortResponse(LuseepyBeam):
         turned = (np.stack([on_grid(h, self.theta, grid, turn_deg) for h in p]) for p in parts)
         return AntennaFields(*(np.tensordot(mixing, part, axes=1) for part in turned), grid)
 
-    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
+    def background(self, frequency_mhz: float) -> Float[arrays.Array, " products"]:
         if self.moon_k == self.antenna_k == 0.0:
             return super().background(frequency_mhz)
         circuit = self.circuit(frequency_mhz)
@@ -382,7 +380,7 @@ def read_response(path: str | Path) -> PortResponse:
         hemisphere above the horizon, frequencies that do not increase, numbers that are not finite,
         resistances that do not add up, or a header that states other conventions.
     """
-    response = read_fits(path, RESPONSE_LAYOUT, "check beam.file")
+    response = formats.read_fits(path, RESPONSE_LAYOUT, "check beam.file")
     require_conventions(path, response.values)
     images = response.arrays
     frequencies, theta_deg, phi_deg = (images[name] for name in AXES)
@@ -477,7 +475,7 @@ class ScalarBeam(LuseepyBeam):
         (ohm,) = self._at(frequency_mhz, self.impedance_ohm)
         return complex(ohm)
 
-    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
+    def background(self, frequency_mhz: float) -> Float[arrays.Array, " products"]:
         """Return the visibilities without any sky: the emission of the ground.
 
         The ground fills the part of an auto's beam that the sky does not. Arms in an enclosure of
@@ -508,7 +506,7 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
         hemisphere above the horizon, frequencies that do not increase, numbers that are not finite,
         or a header that states other conventions.
     """
-    beam = read_fits(path, SCALAR_LAYOUT, "check beam.file")
+    beam = formats.read_fits(path, SCALAR_LAYOUT, "check beam.file")
     images, said, sizes = beam.arrays, beam.values, beam.sizes
     require_conventions(path, said)
     if (sizes["theta"], sizes["phi"]) != (said["THETA_N"], said["PHI_N"]):
