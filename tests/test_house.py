@@ -64,9 +64,7 @@ def test_every_text_names_its_encoding():
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Attribute):
                 continue
-            mode = (
-                call.args[0].value if call.args and isinstance(call.args[0], ast.Constant) else ""
-            )
+            mode = getattr(call.args[0], "value", "") if call.args else ""
             opens = call.func.attr == "open" and mode in ("r", "w", "a", "x")
             if opens or call.func.attr in ("read_text", "write_text"):
                 assert any(one.arg == "encoding" for one in call.keywords), (path, call.lineno)

@@ -36,9 +36,7 @@ def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: in
         )
     least = PER_CHAIN * chains
     for column, what in (("ess_bulk", "bulk"), ("ess_tail", "tail")):
-        if column not in table:
-            continue
-        size = np.nan_to_num(table[column], nan=np.inf)
+        size = np.nan_to_num(table.get(column, np.inf), nan=np.inf)
         few = int((size < least).sum())
         if few:
             worst = int(np.argmin(size))

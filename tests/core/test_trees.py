@@ -73,9 +73,8 @@ class Everything:
 def same(a: Any, b: Any) -> bool:
     """Whether two values are equal, with NaN equal to itself, and of the same type and dtype."""
     if is_dataclass(a):
-        return type(a) is type(b) and all(
-            same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a)
-        )
+        pairs = ((getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+        return type(a) is type(b) and all(same(*pair) for pair in pairs)
     if isinstance(a, pd.DataFrame):
         pd.testing.assert_frame_equal(a, b)
         return True

@@ -158,9 +158,8 @@ def test_disturbances_are_found_and_little_else(tmp_path):
         assert (reason[~burst & ~saturated] == BURST).mean() <= 1e-3
         assert not np.isin(reason, [NO_DATA, COMB]).any()
         within = np.abs(mhz - f) <= 0.5 + 1e-9
-        injected = (tone[:, None] & truth["tone_channel"][within]) | (
-            comb[:, None] & (np.arange(2048)[within] % 4 == 2)
-        )
+        of_comb = comb[:, None] & (np.arange(2048)[within] % 4 == 2)
+        injected = (tone[:, None] & truth["tone_channel"][within]) | of_comb
         flagged = np.rint(reduced.lines[band] * within.sum())
         rows, expected = ~saturated, injected.sum(axis=1)
         found = np.minimum(flagged, expected)[rows].sum() / expected[rows].sum()

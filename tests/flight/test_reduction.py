@@ -259,9 +259,8 @@ def test_the_turntable_turns_when_the_scenario_says(flight, table, reduced):
     given = recipe(table, timestamp="start", turns={(times[3] + 60.0 * u.s).isot: 30.0})
     one = reduce_sessions([at, *sessions(flight, "bcd")], given)
     np.testing.assert_array_equal(one.reason[:, 2:5] == rd.NO_DATA, [[False, True, False]] * 2)
-    refuse(
-        "flight.turns.*noon", reduce_sessions, sessions(flight), recipe(table, turns={"noon": 3})
-    )
+    given = recipe(table, turns={"noon": 3})
+    refuse("flight.turns.*noon", reduce_sessions, sessions(flight), given)
 
 
 def test_an_auto_of_zero_takes_its_port_along(flight, table, tmp_path):

@@ -273,9 +273,8 @@ def test_temperatures_of_all_channels_are_those_of_one_gaussian(cube, expected, 
     assert header[1] == "S [Jy]" and float(rows[0][1].replace(",", "")) == round(flux.iloc[0], 1)
     # unknowns that channels share make their errors alike
     assert (spectrum.covariance[0, 0, 1:] > 1e-3 * spectrum.std[0, 0] * spectrum.std[0, 1:]).any()
-    off = spectrum.temperature[0] - np.array(
-        [c.truth[0] / np.sqrt(4.0 * np.pi) for c in cube.channels]
-    )
+    truth = np.array([c.truth[0] for c in cube.channels]) / np.sqrt(4.0 * np.pi)
+    off = spectrum.temperature[0] - truth
     expected_chi2 = off @ np.linalg.inv(spectrum.covariance[0]) @ off
     assert spectrum.chi2("mean sky").chi2 == pytest.approx(expected_chi2, rel=1e-6)
 

@@ -124,12 +124,9 @@ def test_limits_on_a_signal_cover_it(injected, found):
     alike = np.exp(-0.5 * (np.log2(f[:, None] / f) / 0.3) ** 2)
     covariance = np.outer(sky, sky) * (0.7 * alike + 0.3 * np.eye(len(f))) * 1e-6
     rng, name = np.random.default_rng(5), "trough:17.5:3"
-    limits = [
-        signal_limit(
-            spectrum_of(f, sky + injected * trough + one, covariance), *named_template(name)
-        )
-        for one in rng.multivariate_normal(np.zeros(len(f)), covariance, size=100)
-    ]
+    errors = rng.multivariate_normal(np.zeros(len(f)), covariance, size=100)
+    spectra = [spectrum_of(f, sky + injected * trough + one, covariance) for one in errors]
+    limits = [signal_limit(one, *named_template(name)) for one in spectra]
     pulls = np.array([(one.amplitude - injected) / one.std for one in limits])
     # 100 draws: of the mean 0.1, of the rms 0.07
     assert abs(pulls.mean()) < 0.35 and abs(np.sqrt((pulls**2).mean()) - 1.0) < 0.25

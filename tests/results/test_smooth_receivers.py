@@ -271,9 +271,8 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns(
     stds = np.concatenate([*stds, np.ones(3 * N_OWN)])
     dense, unmixed = DenseChannels.of(scenario), np.eye(len(stds))
     for port in range(4 * N_MODES, 4 * N_MODES + N_PORTS if smooth else 0):
-        unmixed[port::N_OWN, port::N_OWN] = np.linalg.cholesky(
-            ties(np.asarray(prior.frequencies_mhz))
-        )
+        alike = ties(np.asarray(prior.frequencies_mhz))
+        unmixed[port::N_OWN, port::N_OWN] = np.linalg.cholesky(alike)
     skies = np.zeros((3 * N_MODES, len(stds)))
     skies[:, :N_MODES] = np.kron(np.asarray(prior.mixing), np.eye(N_MODES))
     skies[:, N_MODES : 4 * N_MODES] = np.eye(3 * N_MODES)

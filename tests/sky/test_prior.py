@@ -96,10 +96,9 @@ def test_what_no_prior_is_is_refused():
         jnp.array([1.0, 1.0, -0.5, -1.0]),
     )
     refuse("prior spectrum.*NaN", harmonic, jnp.array([1.0, jnp.nan]))
-    refuse(
-        "ell = 2 the prior has a mean, but no variance", harmonic, jnp.asarray(SPECTRUM), mean=MEAN
-    )
-    refuse("the prior mean has shape", harmonic, jnp.asarray(SPECTRUM[:2]), mean=MEAN)
+    spectrum = jnp.asarray(SPECTRUM)
+    refuse("ell = 2 the prior has a mean, but no variance", harmonic, spectrum, mean=MEAN)
+    refuse("the prior mean has shape", harmonic, spectrum[:2], mean=MEAN)
 
 
 def test_pixels_of_an_isotropic_sky_are_those_of_the_addition_theorem(harmonic):

@@ -93,9 +93,8 @@ def test_powers_in_volts_and_their_slope(response_file):
     keys = "slope: -2, reference_mhz: 5"
     volts = set_up(four_ports(response_file, f"noise.receiver={{power_v2_hz: 1e-17, {keys}}}"))
     moon = ground(response_file, 250.0)[AUTOS]
-    np.testing.assert_allclose(
-        volts.background[AUTOS, 0] - moon, 1e-17 / 16 / per_kelvin, rtol=1e-9
-    )
+    expected = 1e-17 / 16 / per_kelvin
+    np.testing.assert_allclose(volts.background[AUTOS, 0] - moon, expected, rtol=1e-9)
     kelvin = set_up(four_ports(response_file, f"noise.receiver={{power_k: 160, {keys}}}"))
     np.testing.assert_allclose(kelvin.background[AUTOS, 0] - moon, 10.0, rtol=1e-9)
     # of antennas that know no volts

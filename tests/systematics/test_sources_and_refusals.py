@@ -165,9 +165,8 @@ def test_simulated_data_hold_the_drawn_fluxes():
     sigma = np.sqrt(np.asarray(models.radiometer(setup).diagonal()))
 
     def misfit(flux):
-        return float(
-            (((np.asarray(d.data) - a @ np.asarray(d.truth) - t @ flux) / sigma) ** 2).sum()
-        )
+        left = np.asarray(d.data) - a @ np.asarray(d.truth) - t @ flux
+        return float(((left / sigma) ** 2).sum())
 
     # chi^2 of 96 data, beyond which it is once in a million
     low, high = chi2.ppf(5e-7, 96), chi2.isf(5e-7, 96)

@@ -116,9 +116,8 @@ def test_found_drifts_have_the_shift_of_the_volume():
     a = np.asarray(e.setup.coupling.dense())
     sigma = np.sqrt(np.asarray(radiometer(e.setup, found.around).diagonal()))
     kernel = np.asarray(drifts.drift.kernel(np.subtract.outer(hours, hours)))
-    root = np.kron(
-        np.eye(4), np.linalg.cholesky(kernel + 1e-12 * kernel[0, 0] * np.eye(len(hours)))
-    )
+    kernel = kernel + 1e-12 * kernel[0, 0] * np.eye(len(hours))
+    root = np.kron(np.eye(4), np.linalg.cholesky(kernel))
     s = np.sqrt(np.asarray(e.setup.prior.variance()))
 
     def seen(x):  # unit normals of the sky, then of the drifts
