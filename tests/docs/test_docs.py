@@ -23,8 +23,7 @@ from nbclient import NotebookClient
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.harmonics import from_healpy
-from lusee_bayes.core.reading import parse_yaml
+from lusee_bayes.core import harmonics, reading
 from lusee_bayes.experiment.scenario import scenario_names
 from lusee_bayes.sampling.mode import estimate_evidence
 
@@ -116,11 +115,11 @@ def test_the_draws_of_the_readme_become_healpys(tmp_path, monkeypatch, no_figure
     made = {"lb": lb}
     exec(block, made)
     assert len(made["skies"]) == 100
-    np.testing.assert_allclose(from_healpy(made["alm"]), made["skies"][0], rtol=1e-14)
+    np.testing.assert_allclose(harmonics.from_healpy(made["alm"]), made["skies"][0], rtol=1e-14)
 
 
 def test_the_citation_is_whole():
-    citation = parse_yaml((ROOT / "CITATION.cff").read_text(), "the file")
+    citation = reading.parse_yaml((ROOT / "CITATION.cff").read_text(), "the file")
     assert citation["cff-version"] == "1.2.0"
     # what the standard asks for
     assert {"authors", "message", "title"} <= set(citation)

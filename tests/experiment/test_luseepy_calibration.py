@@ -18,8 +18,7 @@ from scipy.stats import chi2, kstest
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import base_model, set_up
-from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.instrument.waterfalls import read_waterfall
+from lusee_bayes.instrument import products, waterfalls
 
 pytestmark = pytest.mark.long
 SITE = {"lon_deg": 182.258, "lat_deg": -23.814}
@@ -81,14 +80,14 @@ def test_posteriors_of_gaussian_skies(naive, test_data, quadrature, calibrated):
     chi^2 follows its distribution with luseepy's rule, and does not with the exact quadrature."""
     lmax, every = 6, 10
     beam = test_data / "luseepy" / "synthetic_monopole_beam.fits"
-    waterfall = read_waterfall(test_data / "luseepy" / "waterfall_exact_engine.fits")
+    waterfall = waterfalls.read_waterfall(test_data / "luseepy" / "waterfall_exact_engine.fits")
     observation = waterfall.observation.select(np.arange(328) % every == 0)
     overrides = [f"frequency_mhz={FREQUENCY}", f"lmax={lmax}", f"beam.file={beam}"]
     overrides += [f"beam.quadrature={quadrature}", "noise.radiometer.factor=1e-4"]
     scenario = lb.load_scenario("fiducial", overrides)
     matrix = np.concatenate([naive.rows(time, lmax)[None] for time in observation.times])
     matrix = np.moveaxis(matrix, 0, 1).reshape(16 * len(matrix), -1)
-    layout = DataLayout(16, observation.n_times)
+    layout = products.DataLayout(16, observation.n_times)
     given = lb.Visibilities(jnp.zeros(layout.size), layout, observation, FREQUENCY)
     model = base_model(set_up(scenario, given))
 

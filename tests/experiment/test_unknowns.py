@@ -10,9 +10,8 @@ from experiments import drawn, four_ports, parts, unknowns_report, with_known_sk
 from reference_linear import white_posterior
 
 import lusee_bayes as lb
+from lusee_bayes.experiment import model, unknowns
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import set_up, true_values
-from lusee_bayes.experiment.unknowns import NullDirection
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.report.pages import map_page
 from lusee_bayes.systematics.context import Setup
@@ -58,7 +57,7 @@ def test_table_and_null_direction_are_those_of_the_joint_posterior(experiment):
     np.testing.assert_allclose(table["std"], scale * expected.std[16:], rtol=1e-5)
     off = (table["value"] - mean - scale * (shift + expected.mean[16:])) / table["std"]
     assert np.abs(off).max() < 1e-4
-    truth = true_values(experiment.setup)
+    truth = model.true_values(experiment.setup)
     wanted = [truth[name] for name in names[:5]] + list(0.01 * truth["gain_table"])
     np.testing.assert_allclose(table["true"], wanted, rtol=1e-12)
     assert (np.abs(table["value"] - table["true"]) < 4 * table["std"]).all()
@@ -92,14 +91,14 @@ def test_the_null_direction_in_words():
     """Two unknowns of which the data tell the sum only, and one that they tell."""
     ridge = np.array([[0.5, -0.5, 0.0], [-0.5, 0.5, 0.0], [0.0, 0.0, 0.01]])
     names, covariance = ["uniform sky", "regolith", "receiver 0"], 0.8 * ridge + 1e-6 * np.eye(3)
-    null = NullDirection.of(names, covariance)
+    null = unknowns.NullDirection.of(names, covariance)
     assert null.share == pytest.approx(0.8, abs=1e-5)
     regolith, sky = sorted(null.words().split(", "))
     assert (regolith[:-6], sky[:-6]) == ("regolith", "uniform sky")
     assert {regolith[-5:], sky[-5:]} == {"+0.71", "-0.71"}
     assert null.sentence().endswith("its variance is 80% of the prior variance.")
     # nothing to say where the data tell most of it
-    assert NullDirection.of(["uniform sky", "regolith"], 0.4 * np.eye(2)).sentence() == ""
+    assert unknowns.NullDirection.of(["uniform sky", "regolith"], 0.4 * np.eye(2)).sentence() == ""
 
 
 @pytest.mark.parametrize(("common", "told"), [(None, False), (0.5, False), (0.95, True)])
@@ -146,7 +145,7 @@ def test_a_run_writes_them(experiment, tmp_path):
 
 def at_truth(setup: Setup) -> Setup:
     """The same with receivers and ground that are known to be the truth."""
-    noise, truth = setup.scenario.noise, true_values(setup)
+    noise, truth = setup.scenario.noise, model.true_values(setup)
     ignored = {"treatment": "ignored"}
     fixed = {k: getattr(noise, k).model_copy(update=ignored) for k in ("receiver", "regolith")}
     scenario = setup.scenario.model_copy(update={"noise": noise.model_copy(update=fixed)})
@@ -161,7 +160,7 @@ def at_truth(setup: Setup) -> Setup:
 def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(response_file):
     """Of 20 data sets no mode with ell >= 1 moves by 0.1 standard deviations."""
     # known to a fifth, as one who maps a sky with structure knows it
-    first = with_known_sky(set_up(four_ports(response_file, RECEIVER, GROUND)), 0.04)
+    first = with_known_sky(model.set_up(four_ports(response_file, RECEIVER, GROUND)), 0.04)
     moved = []
     for seed in range(20):
         experiment = drawn(first, seed)

@@ -10,9 +10,8 @@ from assertions import refuse
 from astropy import units as u
 from naive_flight import FLIGHT_ORDER, naive_band
 
+from lusee_bayes.flight import gain_model, reduction
 from lusee_bayes.flight import reduced as rd
-from lusee_bayes.flight import reduction
-from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.recipe import FlightSection, Recipe, timeline
 from lusee_bayes.flight.reduction import reduce_sessions
 from lusee_bayes.flight.session_files import read_session
@@ -38,7 +37,7 @@ def truth(flight):
 
 @pytest.fixture(scope="module")
 def table(flight):
-    return read_gain_table(flight / "gain")
+    return gain_model.read_gain_table(flight / "gain")
 
 
 def sessions(flight, names="abcd"):

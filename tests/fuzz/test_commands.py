@@ -16,8 +16,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.keys import scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.runs.cost import posterior_cost, require_fits
-from lusee_bayes.runs.plan_run import given_variations
+from lusee_bayes.runs import cost, plan_run
 
 FEW, MANY = 30, 3_000 * SCALE
 SMALL = ("--set", "lmax=2", "--set", "observation.runs.0.cycles=0.02", "-q")
@@ -188,7 +187,7 @@ def load(overrides: list[str]) -> None:
     # what is taken can be written and read again, and is small enough or refused
     again = parse_yaml(scenario.to_yaml(), "the resolved scenario")
     assert Scenario.model_validate(again) == scenario
-    require_fits(posterior_cost(scenario), scenario)
+    cost.require_fits(cost.posterior_cost(scenario), scenario)
 
 
 @few_and_many
@@ -209,7 +208,7 @@ def test_any_text_as_an_override(n):
     @example("prior.mean_file=" + 100 * "\u0331" + " x")  # longer than a line, in escaped letters
     def check(override):
         require_answer(lambda: load([override]))
-        require_answer(lambda: given_variations("fiducial", [override], []))
+        require_answer(lambda: plan_run.given_variations("fiducial", [override], []))
 
     check()
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from assertions import refuse
 
-from lusee_bayes.instrument.beams.monopoles import Monopoles
-from lusee_bayes.instrument.beams.sampled import read_beam
+from lusee_bayes.instrument.beams import monopoles, sampled
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.testing import check_beam_source
 
@@ -17,13 +16,13 @@ FREQUENCY, LMAX, TURNED_DEG = 25.0, 6, 30.0
 @pytest.fixture(scope="module")
 def scalar(test_data):
     """The beam of one arm: synthetic, in steps of 1 degree."""
-    return read_beam(test_data / "luseepy" / "synthetic_monopole_beam.fits")
+    return sampled.read_beam(test_data / "luseepy" / "synthetic_monopole_beam.fits")
 
 
 @pytest.fixture(scope="module")
 def response(test_data):
     """Short dipoles with luseepy's receivers, in steps of 2 degrees."""
-    return read_beam(test_data / "luseepy" / "synthetic_response_v3.fits")
+    return sampled.read_beam(test_data / "luseepy" / "synthetic_response_v3.fits")
 
 
 # nodes between the files' directions see splines: 1e-10 measured. luseepy's rule for scalar beams
@@ -39,7 +38,7 @@ def check(source: BeamSource, quadrature: float) -> None:
 
 
 def test_embedded_beams():
-    source = Monopoles(turntable_offset_deg=4.0)
+    source = monopoles.Monopoles(turntable_offset_deg=4.0)
     check(source, 1e-12)
     assert not source.background(FREQUENCY).any() and source.impedance(FREQUENCY) is None
     assert source.circuit(FREQUENCY) is None

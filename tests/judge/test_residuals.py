@@ -17,10 +17,9 @@ from scipy.stats import chi2
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.instrument.coupling import DenseCoupling
-from lusee_bayes.judge import left_out
+from lusee_bayes.judge import left_out, measures
 from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare, stands_out
 from lusee_bayes.judge.left_out import KINDS, LeftOut, groups_of
-from lusee_bayes.judge.measures import preferences
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.judge.split import WIDER, Split, widened
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap, form_of
@@ -365,7 +364,7 @@ def test_amplitudes_errors_and_gains(low_rank):
     # the last one is a sky that the prior allows, but for a small part
     templates = rng.standard_normal((N_DATA, N))
     templates[:, -1] = a @ rng.standard_normal(a.shape[1]) + 0.01 * templates[:, -1]
-    got = preferences(model.condition(data), templates)
+    got = measures.preferences(model.condition(data), templates)
     k = a @ np.diag(np.asarray(prior.variance())) @ a.T + np.asarray(noise.dense())
     mean = np.asarray(model.predict(prior.colour(prior.white_mean)))
     inverse = np.linalg.inv(k)
@@ -387,7 +386,7 @@ def test_what_the_sky_takes_up_is_not_told():
     prior = lb.HarmonicPrior(np.full(LMAX + 1, 1e14))
     model = lb.LinearGaussian(DenseCoupling(a), prior, lb.DiagonalCovariance(np.ones(N_DATA)))
     data = rng.standard_normal(N_DATA)
-    got = preferences(model.condition(data), a @ rng.standard_normal((a.shape[1], 1)))
+    got = measures.preferences(model.condition(data), a @ rng.standard_normal((a.shape[1], 1)))
     assert np.isnan([got["value"], got["std"]]).all()
 
 

@@ -12,9 +12,8 @@ from scipy.optimize import minimize
 
 import lusee_bayes as lb
 from lusee_bayes.linear.information import Information, integrated_out
-from lusee_bayes.priors import learning
+from lusee_bayes.priors import learning, local_scales
 from lusee_bayes.priors.families import FREEDOM, Hyperprior, IsotropicFamily
-from lusee_bayes.priors.local_scales import embedded_local_scales
 
 LMAX, N_DATA = 6, 120
 
@@ -78,7 +77,7 @@ def test_the_curvature_is_that_of_the_evidence(case):
 
 def test_learning_gains_over_the_start_under_local_scales():
     """A sky of a strong plane is told from one without it."""
-    family = embedded_local_scales(25.0, LMAX)
+    family = local_scales.embedded_local_scales(25.0, LMAX)
     theta = family.hyperprior.start()
     sky = np.asarray(family.prior(family.at(theta).covariance).sample(jax.random.key(7)))
     information = information_of(sky)
@@ -101,7 +100,7 @@ def test_learning_gains_over_the_start_under_local_scales():
 
 def test_a_sky_without_texture_has_none():
     """Data that only limit the texture's level: the best is where it no longer matters."""
-    family = embedded_local_scales(25.0, LMAX)
+    family = local_scales.embedded_local_scales(25.0, LMAX)
     information = information_of(1.02 * family.mean)
     found = learning.learn_whatever_fits(family, information)
     assert found.settled and found.noise_factor == 1.0

@@ -8,15 +8,14 @@ from reference import real_harmonics, sphere
 from reference_linear import random_covariance
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles
+from lusee_bayes.instrument.beams import fields, monopoles
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.instrument_errors import beam_error_noise, difference, rms_difference
 from lusee_bayes.sky.prior import DensePrior
 
 LMAX, FREQUENCY = 4, 25.0
-ANTENNAS = Monopoles(turntable_offset_deg=10.0)
+ANTENNAS = monopoles.Monopoles(turntable_offset_deg=10.0)
 
 
 @pytest.fixture(scope="module")
@@ -61,14 +60,14 @@ def test_rms_difference_is_that_over_directions(beams, shifted):
     got = rms_difference(shifted, beams)
     assert got == pytest.approx(expected, rel=1e-12) and 0.02 < got < 0.5
     assert rms_difference(beams, beams) == 0.0
-    double = ProductBeams(3.0 * beams.modes, FREQUENCY)
+    double = fields.ProductBeams(3.0 * beams.modes, FREQUENCY)
     assert rms_difference(double, beams) == pytest.approx(2.0, rel=1e-14)
     assert rms_difference(beams, double) == pytest.approx(2.0 / 3.0, rel=1e-14)
 
 
 @pytest.mark.parametrize("shape", [(16, 36), (9, 25)])
 def test_beams_that_do_not_match_are_refused(beams, shape):
-    other = ProductBeams(jnp.ones(shape), FREQUENCY)
+    other = fields.ProductBeams(jnp.ones(shape), FREQUENCY)
     message = rf"coefficients has shape \({shape[0]}, {shape[1]}\), expected \(16, 25\)"
     for use in (difference, rms_difference):
         refuse(message, use, other, beams)

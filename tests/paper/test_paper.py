@@ -12,13 +12,11 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from commands import assert_drawn, table_of
 
-from lusee_bayes.core import formats
-from lusee_bayes.core.harmonics import map_to_modes
+from lusee_bayes.core import formats, harmonics
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.paper import cases as paper
-from lusee_bayes.paper.claims import CLAIMS, claim_table
-from lusee_bayes.paper.figures import FIGURES
+from lusee_bayes.paper import claims, figures
 from lusee_bayes.runs import paper_run as runs
 
 TINY = ["lmax=6", "observation.step_s=43200"]
@@ -74,7 +72,7 @@ def computed(monkeypatch):
 def test_everything_is_written(folder):
     names = "cases figures cases.csv claims.csv claims.md manifest.json"
     assert {p.name for p in folder.iterdir()} == set(names.split())
-    assert {p.stem for p in (folder / "figures").iterdir()} == set(FIGURES)
+    assert {p.stem for p in (folder / "figures").iterdir()} == set(figures.FIGURES)
     assert_drawn(*(folder / "figures").iterdir())
     assert {p.name for p in (folder / "cases").iterdir()} == {f"{n}.nc" for n in paper.CASES}
     rows = table_of(folder / "cases.csv")
@@ -85,13 +83,13 @@ def test_everything_is_written(folder):
 @pytest.mark.long
 def test_claims_have_every_column_filled(folder):
     rows = table_of(folder / "claims.csv")
-    assert len(rows) == len(CLAIMS) > 20
+    assert len(rows) == len(claims.CLAIMS) > 20
     for row in rows:
         assert set(row) == {"section", "paper", "obtained", "agrees", "reason"}
         assert all(row.values()), row
         assert row["agrees"] in ("yes", "partly", "no")
         assert (row["reason"] == "agrees") == (row["agrees"] == "yes")
-    assert len((folder / "claims.md").read_text().splitlines()) == len(CLAIMS) + 4
+    assert len((folder / "claims.md").read_text().splitlines()) == len(claims.CLAIMS) + 4
 
 
 @pytest.mark.long
@@ -234,8 +232,8 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
         {
             "rho": ("ell", rho), "snr": ("ell", snr), "cl_mean": ("ell", power),
             "cl_truth": ("ell", np.ones(48)), "mean": ("pixel", mean), "truth": ("pixel", truth),
-            "mean_modes": ("mode", map_to_modes(mean, 8)),
-            "truth_modes": ("mode", map_to_modes(truth, 8)),
+            "mean_modes": ("mode", harmonics.map_to_modes(mean, 8)),
+            "truth_modes": ("mode", harmonics.map_to_modes(truth, 8)),
             "highest_altitude": ("pixel", altitude), "data": (("product", "time"), data),
             "noise_std": (("product", "time"), noise),
             "beam": (("pattern", "theta", "phi"), np.stack([beam] * 3)),
@@ -248,5 +246,5 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
 @pytest.mark.parametrize("agrees", [True, False])
 def test_every_claim_can_come_out_both_ways(agrees):
     cases = {name: synthetic(name, agrees) for name in paper.CASES}
-    verdicts = {row["paper"]: row["agrees"] for row in claim_table(cases)}
+    verdicts = {row["paper"]: row["agrees"] for row in claims.claim_table(cases)}
     assert not {s: v for s, v in verdicts.items() if (v == "yes") != agrees}

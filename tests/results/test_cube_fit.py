@@ -9,16 +9,15 @@ from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.judge import cube_fit, split
 from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare
-from lusee_bayes.judge.cube_fit import ChannelFits
-from lusee_bayes.judge.split import WIDER
 
 FREQUENCIES = np.linspace(5.0, 50.0, 46)
 
 
 def fits(chi2, n=5000.0, prior=(200.0, 200.0), **more):
     channels = tuple(ChiSquare(float(x), n) for x in chi2)
-    return ChannelFits(FREQUENCIES[: len(chi2)], channels, ChiSquare(*prior), **more)
+    return cube_fit.ChannelFits(FREQUENCIES[: len(chi2)], channels, ChiSquare(*prior), **more)
 
 
 def test_each_joint_test_is_right_where_the_model_holds():
@@ -96,7 +95,7 @@ def test_chi2_of_a_channel_is_that_of_its_data_under_the_model(small_cube):
         sky = a @ s @ a.T
         assert channel.chi2_model == pytest.approx(d @ np.linalg.solve(sky + n, d), rel=1e-4)
         # what no sky explains, with a prior that is wide by hand
-        expected = d @ np.linalg.solve(WIDER**2 * sky + n, d)
+        expected = d @ np.linalg.solve(split.WIDER**2 * sky + n, d)
         assert channel.instrument.chi2 == pytest.approx(expected, abs=0.02 * expected)
     fits = run.fits()
     total, n_data = (sum(getattr(c, k) for c in run.channels) for k in ("chi2_model", "n_data"))

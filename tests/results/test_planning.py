@@ -13,9 +13,8 @@ from experiments import flagged
 from reference_linear import matrices
 
 import lusee_bayes as lb
-from lusee_bayes.core.engine import ThisProcess
+from lusee_bayes.core import engine, progress
 from lusee_bayes.core.harmonics import sum_over_m
-from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model, set_up
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.judge.measures import ell_cross
@@ -188,7 +187,7 @@ def test_what_is_there_twice_is_computed_once(monkeypatch, tmp_path):
         lambda variation: computed.append(variation) or replace(first, variation=variation),
     )
     again, broken = replace(whole, name="again"), replace(whole, lost=(1,))
-    given = [whole, again, broken], tmp_path, ThisProcess(), Stages()
+    given = [whole, again, broken], tmp_path, engine.ThisProcess(), progress.Stages()
     made = plan_run.forecasts_of(*given)
     rows = forecast_rows(made)
     assert computed == [whole, broken]

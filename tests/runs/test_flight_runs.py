@@ -16,9 +16,8 @@ from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.data_files import reduce_files
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
+from lusee_bayes.report import pages, rendering
 from lusee_bayes.report.figures.judgement import calibration
-from lusee_bayes.report.pages import flight_section
-from lusee_bayes.report.rendering import render
 from lusee_bayes.runs.data_run import reduced_lines, run_simulate_flight
 
 SET = ["lmax=3", "frequency_mhz=20", "observation.step_s=900", "observation.runs=[{cycles: 0.003}]"]
@@ -163,7 +162,7 @@ def reduced(of_two_bands):
 
 def page_of(reduced, folder):
     write_reduced(folder / "reduced.nc", reduced)
-    return render("flight.html", folder, flight=flight_section(folder))
+    return rendering.render("flight.html", folder, flight=pages.flight_section(folder))
 
 
 def test_the_section_says_how_spectra_were_reduced(reduced, tmp_path):

@@ -16,8 +16,7 @@ from scipy.stats import multivariate_normal, norm
 import lusee_bayes as lb
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.amplitudes import Amplitudes
-from lusee_bayes.sampling.hmc import Chains
-from lusee_bayes.sampling.programs import numpyro_promotion
+from lusee_bayes.sampling import hmc, programs
 from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel
 from lusee_bayes.systematics.systematic import Unknown
 
@@ -46,7 +45,7 @@ def test_the_density_is_that_of_all_channels_at_once(octaves):
     sites = {"10MHz/common": common}
     for name, s, o in zip(FREQUENCIES, smooth, own, strict=True):
         sites |= {f"{name}/smooth": s, f"{name}/own": o}
-    with numpyro_promotion():
+    with programs.numpyro_promotion():
         found, trace = log_density(shared, (), {"channels": CHANNELS, "data": DATA}, sites)
     x, means = np.log2(list(FREQUENCIES.values())), np.array(list(MEANS.values()))
     kernel = np.exp(-0.5 * ((x[:, None] - x) / octaves) ** 2) * np.outer(means, means) * 0.01
@@ -61,7 +60,7 @@ def test_the_density_is_that_of_all_channels_at_once(octaves):
 def test_what_is_nearly_the_same_has_no_site_of_its_own():
     """Over 1e6 octaves the variance that is left is below rounding: one site, scaled."""
     shared = SharedSites(program, FREQUENCIES, {"smooth": 1e6})
-    with numpyro_promotion():
+    with programs.numpyro_promotion():
         trace = handlers.trace(handlers.seed(shared, jax.random.key(0))).get_trace(CHANNELS, DATA)
     z = [float(trace[f"{c}/smooth"]["value"] / m - 1.0) / 0.1 for c, m in MEANS.items()]
     kinds = [trace[f"{name}/smooth"]["type"] for name in FREQUENCIES]
@@ -70,7 +69,7 @@ def test_what_is_nearly_the_same_has_no_site_of_its_own():
 
 
 def test_a_channel_has_its_own_names():
-    chains = Chains({"10MHz/sky": np.ones(1), "18MHz/sky": np.zeros(1)}, {"lp": np.zeros(1)})
+    chains = hmc.Chains({"10MHz/sky": np.ones(1), "18MHz/sky": np.zeros(1)}, {"lp": np.zeros(1)})
     assert of_channel(chains, "18MHz").sites == {"sky": np.zeros(1)}
 
 

@@ -22,9 +22,8 @@ from small_models import random_gaussian
 import lusee_bayes as lb
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
 from lusee_bayes.noise.covariance import DenseCovariance
+from lusee_bayes.sampling import mode, programs
 from lusee_bayes.sampling.hmc import Whitening, whitened
-from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sky.prior import DensePrior
 
 LMAX = 2
@@ -79,7 +78,7 @@ def strong_sky(coupling, offset, prior, fixed_noise, data=None):
 
 def joint(model, arguments, values):
     """ln p of all sites at these values, by NumPyro, whose own code mixes types."""
-    with numpyro_promotion():
+    with programs.numpyro_promotion():
         return float(log_density(model, (), arguments, values)[0])
 
 
@@ -180,7 +179,7 @@ def test_predictions_from_draws_of_z(gaussian, case):
     posterior, n = gaussian.condition(arguments["data"]).posterior, 4000
     z = jax.random.normal(jax.random.key(3), (n, 9), dtype=jnp.float64)
     free = {**arguments, "data": None}
-    with numpyro_promotion():
+    with programs.numpyro_promotion():
         predictive = Predictive(whitened(program("sky"), whitening), {"sky_white": z})
         drawn = predictive(jax.random.key(4), **free)
     expected = np.asarray(whitening.mean) + np.asarray(z) @ np.asarray(whitening.root).T
@@ -200,7 +199,7 @@ def test_the_gaussian_about_the_mode_of_a_linear_model_is_its_posterior():
     prior = DensePrior(jnp.linalg.cholesky(half @ half.T + np.eye(9)))
     a, data = (jnp.asarray(rng.standard_normal(shape)) for shape in ((6, 9), 6))
     model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(6)))
-    found = laplace_approximation(program.model, {**program.arguments(model), "data": data})
+    found = mode.laplace_approximation(program.model, {**program.arguments(model), "data": data})
     expected, root = model.condition(data).posterior, np.asarray(found.whitening.root)
     np.testing.assert_allclose(found.whitening.mean, expected.mean, atol=1e-9)
     np.testing.assert_allclose(root @ root.T, expected.covariance(), atol=1e-9)

@@ -9,8 +9,7 @@ import pytest
 import lusee_bayes as lb
 from lusee_bayes.core.linalg import main_directions
 from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate, true_signal
-from lusee_bayes.systematics import above_lmax
-from lusee_bayes.systematics.context import prior_and_family
+from lusee_bayes.systematics import above_lmax, context
 
 LMAX, MARGIN, N = 5, 4, 36
 RUNS = "observation={runs: [{cycles: 0.3}], step_s: 14400}"
@@ -36,7 +35,7 @@ def test_integrated_out_is_the_marginal_of_the_posterior_of_all_modes(both, monk
     data = simulate(whole).with_truth_up_to(LMAX)
     setup = set_up(own, data)
     a, n = np.asarray(whole.coupling.dense()), np.asarray(radiometer(setup).diagonal())
-    prior = prior_and_family(whole.scenario, whole.sky)[0]
+    prior = context.prior_and_family(whole.scenario, whole.sky)[0]
     s = np.array(prior.covariance())
     mean = np.zeros(len(s)) if prior.mean is None else np.asarray(prior.mean)
     s[:N, :N], s[:N, N:], s[N:, :N] = np.asarray(setup.prior.covariance()), 0.0, 0.0

@@ -18,12 +18,9 @@ from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, set_up, true_values
 from lusee_bayes.experiment.unknowns import SKY
 from lusee_bayes.judge.coverage import LEVELS
-from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import numpyro_promotion
+from lusee_bayes.sampling import mode, programs
 from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, calibrate
-from lusee_bayes.systematics.gain_drifts import SCALES
-from lusee_bayes.systematics.gain_table import COMMON_GAIN
-from lusee_bayes.systematics.systematic import Chart
+from lusee_bayes.systematics import gain_drifts, gain_table, systematic
 
 TINY = ("lmax=6", "observation.runs.0.cycles=0.02")  # 96 data, 49 modes
 MONTH = ("lmax=6", "observation.step_s=172800")  # a sample every other day: all sources rise
@@ -62,15 +59,15 @@ class Draws(eqx.Module):
     arguments: dict
     sampler: lb.Sampler = eqx.field(static=True)
     starts: int = eqx.field(static=True, default=1)
-    chart: Chart | None = None
+    chart: systematic.Chart | None = None
     thin: int = eqx.field(static=True, default=1)
 
     def __call__(self, key, data):
         model, arguments = self.program.model, {**self.arguments, "data": data}
         start, hold = None, ()
         if self.chart is not None:
-            start, hold = {"sky": marginalised(arguments, data).mean}, SCALES
-        found = laplace_approximation(model, arguments, start, hold, self.starts, self.chart)
+            start, hold = {"sky": marginalised(arguments, data).mean}, gain_drifts.SCALES
+        found = mode.laplace_approximation(model, arguments, start, hold, self.starts, self.chart)
         return ex.draw_within(model, arguments, key, self.sampler, found.whitening, self.thin)
 
 
@@ -87,7 +84,7 @@ def ranks_of(program, arguments, quantities, *, draws=None, n=100, seed=1, regio
     """One data set after the other: in a batch, each would wait for the slowest."""
     given = Truth(program, arguments), draws or Draws(program, arguments, hmc(60)), quantities
     options = {"n_simulations": n, "seed": seed, "batch": 1, "regions": regions}
-    with numpyro_promotion():
+    with programs.numpyro_promotion():
         return calibrate(*given, **options)
 
 
@@ -228,7 +225,7 @@ def test_simulation_based_calibration(response_file):
         ranks.append((draws < true).sum(0)[[*MODES, *range(16, 25)]])
         # along the null direction, in prior standard deviations
         report = ex.unknowns_report(experiment, found)
-        assert report.null.names[0] == SKY and report.null.names[-1] == COMMON_GAIN
+        assert report.null.names[0] == SKY and report.null.names[-1] == gain_table.COMMON_GAIN
         off = true - mean
         parts = np.concatenate([off[:1] / sky_std[0], off[16:21], [off[21:].sum() / 2.0]])
         null.append(report.null.weights @ parts)

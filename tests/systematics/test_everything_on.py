@@ -13,8 +13,7 @@ from scipy.stats import kstest, norm
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
-from lusee_bayes.experiment import rounds
-from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment import experiment, rounds
 from lusee_bayes.experiment.model import set_up, simulate
 from lusee_bayes.experiment.rounds import Inference, settled
 from lusee_bayes.experiment.scenario import Scenario
@@ -85,7 +84,7 @@ def test_every_unknown_can_be_sampled_beside_all_others(monkeypatch):
         sources = {"list": [{"name": "Cas A"}], "treatment": "sampled"}
         made = lb.build(scenario(10.0, 2, noise=noise, sources=sources, **given))
         program, found = lb.load_program("systematics"), lb.infer(made)
-        arguments = program.arguments(found.model, program_pieces(made))
+        arguments = program.arguments(found.model, experiment.program_pieces(made))
         latent = require_sampleable(program, arguments, np.asarray(made.data.data), 9)
         # so many errors of fields, or of gains, are sampled with the sky
         assert "sky" in latent and len(latent) > 10

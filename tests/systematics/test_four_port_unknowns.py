@@ -15,16 +15,15 @@ from lusee_bayes.experiment import model as models
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate, true_values
 from lusee_bayes.experiment.rounds import Inference, settled
+from lusee_bayes.instrument import products, visibilities
 from lusee_bayes.instrument.beams.sampled import read_beam
-from lusee_bayes.instrument.products import all_products, labels
-from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.gain_table import GainTable
 from lusee_bayes.testing import small_scenario
 
 RECEIVER = "noise.receiver={power_k: 2000, relative_std: 0.1, treatment: %s}"
 GROUND = "noise.regolith={std_k: 30, treatment: %s}"
-AUTOS = [labels().index(f"{port}{port}R") for port in range(4)]
+AUTOS = [products.labels().index(f"{port}{port}R") for port in range(4)]
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +171,7 @@ def slopes(n_times: int) -> np.ndarray:
 
 
 # as of averaged spectra, whose files name the errors of their table
-NAMED = Calibration(np.full(23, 1e10), LEVELS, PORTS, slopes(23))
+NAMED = visibilities.Calibration(np.full(23, 1e10), LEVELS, PORTS, slopes(23))
 
 
 def by_hand(z: np.ndarray, port, slope: np.ndarray) -> np.ndarray:
@@ -180,7 +179,7 @@ def by_hand(z: np.ndarray, port, slope: np.ndarray) -> np.ndarray:
     gain = np.ones((4, slope.shape[1]))
     for value, p, s in zip(z, port, slope, strict=True):
         gain[p] += value * s
-    return np.concatenate([np.sqrt(gain[p.i] * gain[p.j]) for p in all_products()])
+    return np.concatenate([np.sqrt(gain[p.i] * gain[p.j]) for p in products.all_products()])
 
 
 def per_port(z: np.ndarray, n_times: int = 23) -> np.ndarray:
@@ -237,7 +236,7 @@ def test_about_given_values_it_is_the_closed_form(experiment, response_file):
 
 def share() -> np.ndarray:
     """How often each port is in the product of every datum: (data, ports)."""
-    ports = [[(p.i == port) + (p.j == port) for port in range(4)] for p in all_products()]
+    ports = [[(p.i == port) + (p.j == port) for port in range(4)] for p in products.all_products()]
     return np.repeat(np.array(ports, dtype=np.float64), 23, axis=0)
 
 
@@ -418,9 +417,9 @@ def test_beside_what_is_sampled_it_is_marginalised_in_its_place(response_file):
 # --- refused --------------------------------------------------------------------------------------
 
 
-BARE, UNNAMED = "noise.gain_table={}", Calibration(np.full(23, 1e10))
+BARE, UNNAMED = "noise.gain_table={}", visibilities.Calibration(np.full(23, 1e10))
 SLOPES = np.repeat([[0.08], [0.07]], 23, axis=1)
-WIDE = Calibration(np.full(23, 1e10), ("a", "b"), np.array([1, 1]), SLOPES)
+WIDE = visibilities.Calibration(np.full(23, 1e10), ("a", "b"), np.array([1, 1]), SLOPES)
 
 
 BAD_TABLES = [

@@ -16,11 +16,10 @@ from scipy.stats import norm
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import synthesis_matrix, turn_about_z
+from lusee_bayes.experiment import experiment
 from lusee_bayes.experiment import model as models
-from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
-from lusee_bayes.systematics.context import Around
-from lusee_bayes.systematics.systematic import Systematic
+from lusee_bayes.systematics import context, systematic
 
 LMAX, ANGLES, TREATMENTS = 8, (0.0, 40.0), ("marginalised", "ignored")
 KNOWN = "altitude_deg: 1, std_deg: 1.5, harmonics: 2, moon_temperature_k: 250"
@@ -107,7 +106,7 @@ def test_about_values_the_model_is_that_of_simulated_data():
     truth, sky, model = models.true_values(setup), setup.sky.modes, models.base_model(setup)
     expected = np.asarray(models.true_model(setup, truth).predict(sky))
     assert off(model.predict(sky), expected) > 1e-3
-    for _, one in models.systematics(setup, Around(values=truth)):
+    for _, one in models.systematics(setup, context.Around(values=truth)):
         model = one.effect(model, {u.name: np.asarray(truth[u.name]) for u in one.unknowns})
     close(model.predict(sky), expected, 1e-11)
 
@@ -119,7 +118,7 @@ def test_columns_are_the_derivative_of_the_effect():
     model, sky = models.base_model(setup), np.asarray(setup.sky.modes)
     assert np.asarray(horizon.altitude(horizon.values(centre))).min() < -0.01
     columns = horizon.linearised(model, centre)(sky)
-    close(Systematic.linearised(horizon, model, centre)(sky), columns, 1e-8)
+    close(systematic.Systematic.linearised(horizon, model, centre)(sky), columns, 1e-8)
     slopes = differences(horizon, model, sky, centre, 1e-3 * np.eye(7))
     for slope, column in zip(slopes.T, columns.T, strict=True):
         close(slope, column, 1e-5)
@@ -157,7 +156,7 @@ def test_sampled_the_density_is_that_of_beams_behind_the_terrain():
     model = lb.LinearGaussian(there.coupling, setup.prior, noise, there.offset)
     expected = float(model.log_prob(data.data))
     expected += norm.logpdf(list(TRUE.values()), 0, 1.5 / np.sqrt(3)).sum()
-    assert density_of(Experiment(setup, data), TRUE) == pytest.approx(expected, rel=1e-8)
+    assert density_of(experiment.Experiment(setup, data), TRUE) == pytest.approx(expected, rel=1e-8)
 
 
 def test_other_beams_are_behind_the_terrain_too():

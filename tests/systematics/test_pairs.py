@@ -9,8 +9,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import true_values
 from lusee_bayes.noise.instrument_errors import GainDrift
-from lusee_bayes.systematics.gain_drifts import GainDrifts
-from lusee_bayes.systematics.systematic import Marginalised
+from lusee_bayes.systematics import gain_drifts, systematic
 from lusee_bayes.testing import load_scenario, small_scenario
 
 TWO = "observation.runs=[{cycles: 0.12, turntable_deg: 0.0}, {cycles: 0.12, turntable_deg: 40.0}]"
@@ -82,13 +81,13 @@ def test_sampled_drifts_multiply_what_is_marginalised_once(other):
     pieces, values = program_pieces(experiment), dict(true_values(experiment.setup))
     drawn = GainDrift(values["gain_sigma"], values["gain_correlation_h"])
     key, hours = (
-        GainDrifts.own_key(jax.random.key(scenario.seed)),
+        gain_drifts.GainDrifts.own_key(jax.random.key(scenario.seed)),
         experiment.setup.observation.hours,
     )
     values["gains"] = drawn.sample(key, hours)
     model = pieces["gaussian"]()
     for one in pieces["systematics"]():
-        if isinstance(one, Marginalised):
+        if isinstance(one, systematic.Marginalised):
             model = one.sampled(model)
         else:
             model = one.effect(model, {n: jnp.asarray(x) for n, x in values.items()})

@@ -8,8 +8,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment import rounds
 from lusee_bayes.experiment.model import base_model, set_up, systematics
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.systematics.context import Around
-from lusee_bayes.systematics.systematic import Expanded
+from lusee_bayes.systematics import context, systematic
 
 N_DRAWS = 64
 
@@ -48,8 +47,8 @@ def test_draws_estimate_the_trace():
     draws = np.asarray(posterior.sample(jax.random.key(0), N_DRAWS)) - np.asarray(posterior.mean)
 
     def expected(volume):
-        around = Around(sky=setup.sky.modes, values=values, volume=volume)
-        return np.asarray(Expanded.at(antennas, model, around).expected)
+        around = context.Around(sky=setup.sky.modes, values=values, volume=volume)
+        return np.asarray(systematic.Expanded.at(antennas, model, around).expected)
 
     assert (np.abs(expected((draws, draws @ a.T / noise, 0.0)) - exact) < 4.0 * error).all()
     assert (np.abs(exact) > 10.0 * error).any()
