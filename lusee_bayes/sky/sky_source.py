@@ -33,7 +33,7 @@ from lusee_bayes.core.arrays import Array, Modes, Pixels
 from lusee_bayes.core.checks import Described, number, require_array, require_whole
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
+from lusee_bayes.core.formats import has_words, image_names, is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import naming, read_arrays, reading, require_file
@@ -469,10 +469,7 @@ class SkyCube(SkyFile):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        if not is_fits(path):
-            return False
-        with opened(path) as hdus:
-            return LISTED in hdus or all(word in hdus[0].header for word in STEPS)
+        return is_fits(path) and (LISTED.lower() in image_names(path) or has_words(path, STEPS))
 
     @classmethod
     def read(cls, path: str | Path, dataset: str | None = None) -> SkyCube:
