@@ -166,7 +166,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 def require_files(folder: Path, names: Sequence[str], command: str) -> None:
     """Raise InputError if there is no folder, or no such file of ``lusee-bayes command`` in it."""
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise InputError(f"'{folder}' is not a folder; give the folder of a finished run")
     for name in names:
         if not (folder / name).is_file():

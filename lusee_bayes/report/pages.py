@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -182,8 +181,7 @@ def write_report(folder: str | Path) -> Path:
         If the folder has no results of a kind with a page (``PAGES``).
     """
     folder = Path(folder)
-    if not os.path.isdir(folder):
-        raise InputError(f"'{folder}' is not a folder; give the folder of a finished run")
+    require_files(folder, (), "map")
     recover(folder)
     manifest = read_manifest(folder)
     kind = manifest and manifest["kind"]
