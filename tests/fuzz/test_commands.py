@@ -3,6 +3,8 @@
 import json
 import os
 import re
+from itertools import chain
+from pathlib import Path
 
 import pytest
 from changes import SCALE, require_answer
@@ -33,70 +35,15 @@ def folder(tmp_path, monkeypatch):
 
 
 LONG, NUL, OTHER = "n" * 300, "a\0b", "x\udcff.nc"
-IS_PIPE, JOINT = "neither a file nor a folder", "--joint --frequencies 20,25"
+TABLE = Path(__file__).with_name("wrong_commands.yaml")
 # commands about the scenario fiducial are given SMALL, too
 WRONG = [
-    # where results go
-    ("map fiducial -o /", "root of all files"),
-    ("map fiducial -o /proc/nope", "cannot write into|No such"),
-    ("map fiducial -o file/x", "file' is a file; give a folder for the results"),
-    ("simulate fiducial --flight --set flight={} -o file", "is a file"),
-    ("map fiducial -o pipe", IS_PIPE),
+    *chain(*parse_yaml(TABLE.read_text("utf-8"), "a table").values()),
     (f"map fiducial -o {LONG}", "too long"),
     (f"map fiducial -o {NUL}", "NUL"),
-    ("simulate fiducial -o /dev/full", IS_PIPE),
-    # options
-    ("mapp fiducial", "mapp"),
-    ("map fiducial --draw 3", "--draw"),
-    ("map --data gone.nc", "needs the scenario"),
-    ("sample fiducial --chains 0", "--chains: expected .*got 0"),
-    ("sample fiducial --warmup 3", "at least 20, got 3"),
-    ("sample fiducial --algorithm hcm", "hcm.*nuts"),
-    ("validate fiducial --simulations 50", "simulations"),
-    ("map fiducial --frequencies=1:50:1e-9", "at most 4096"),
-    ("map fiducial --joint", "joint needs frequencies_mhz"),
-    ("map fiducial --workers 2", "give --frequencies"),
-    (f"map fiducial {JOINT}", "need at least as many channels, got 2"),
-    ("plan fiducial fiducial", "'fiducial' is listed twice; list each once"),
-    ("plan fiducial --vary lmax", "--vary expects key.path=value,value"),
-    ("plan fiducial --vary lmx=3,4", "unknown key 'lmx'; did you mean 'lmax'"),
-    ("plan fiducial --vary lmax=3,0", "greater than or equal to 1"),
-    ("plan fiducial --set sky.file=/gone/a.fits", "fiducial, as given: no sky map at"),
-    # scenarios
-    ("map nonsense", "no scenario 'nonsense'"),
-    ("map three_cycle", "did you mean 'three_cycles'"),
-    ("map three_cycle.yaml", "no scenario file at 'three_cycle.yaml'; check the path"),
     ("map fiducial --set lmax=" + "9" * 5000, "is not valid YAML"),
-    ("map fiducial --set lmax=383", "of memory.*lmax=.*would fit"),
-    ("map fiducial --set observation.runs.0.cycles=1000000", "about .* of memory .*would fit"),
-    ("map fiducial --set observation.runs.0.cycles=0.0001", "has no sample"),
-    ("map fiducial --set observation.start=soon", "'soon' is not a date"),
-    ("map fiducial --set observation.start=2051-01-01", "outside the ephemeris"),
-    ("map fiducial --set sky.file=gone.fits", "no sky map at 'gone.fits'"),
-    ("simulate fiducial --flight --set flight.gain_table=nowhere.nc", "nowhere.nc"),
-    # what is to be sampled
-    *(
-        (f"map fiducial --set sky.sources=false --set {sampled}", "marginalise; .* sample$")
-        for sampled in (
-            'sources={"list":[{"name":"Jupiter"}],"treatment":"sampled"}',
-            "noise.gain.treatment=sampled",
-            'noise.beam={"shift_mhz":4,"treatment":"sampled"}',
-            "noise.radiometer.log_factor_std=0.5",
-            "prior.tilt_std=0.5",
-            "prior.band_edges=[2,4]",
-        )
-    ),
-    # data, programs, results
-    ("map fiducial --data pipe", IS_PIPE),
-    ("map fiducial --data .", "is a folder"),
-    ("map fiducial --data gone.nc", "no data at 'gone.nc'; make some"),
     (f"map fiducial --data {OTHER}", r"no data at 'x\\udcff.nc'"),
-    ("sample fiducial --model fil", "no program 'fil'.*prior_amplitude"),
-    ("sample fiducial --model gone.py", "no program at 'gone.py'"),
-    ("sample fiducial --model program.py", "no observed site"),
-    ("info [red]x[/red].nc", r"no file at '\[red\]x\[/red\].nc'"),
     (f"info {OTHER}", r"no file at 'x\\udcff.nc'"),
-    ("export . --release out", "not the folder of a run"),
 ]
 
 
