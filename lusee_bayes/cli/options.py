@@ -62,13 +62,11 @@ def parse_frequencies(text: str) -> list[float]:
             if step > 0 and isclose(first + count * step, last, rel_tol=1e-5, abs_tol=1e-8):
                 mhz = [first + k * step for k in range(min(count, MOST_CHANNELS) + 1)]
     if count >= MOST_CHANNELS:
-        raise InputError(
-            f"{text} gives {count + 1} channels; one run allows at most {MOST_CHANNELS}"
-        )
+        wrong = f"{text} gives {count + 1} channels; one run allows at most {MOST_CHANNELS}"
+        raise InputError(wrong)
     if not mhz or any(b <= a for a, b in pairwise(mhz)):
-        raise InputError(
-            f"expected increasing MHz, as 10,25,30 or 5:50:5 (first:last:step), got {text[:40]}"
-        )
+        wrong = f"expected increasing MHz, as 10,25,30 or 5:50:5 (first:last:step), got {text[:40]}"
+        raise InputError(wrong)
     return mhz
 
 

@@ -122,9 +122,8 @@ def require_finite(name: str, array: Any) -> None:
         return
     bad = ~np.isfinite(np.asarray(array))
     if bad.any():
-        raise InputError(
-            f"{name}: NaN or infinity ({_first_offenders(bad)}); flag missing samples instead"
-        )
+        wrong = f"{name}: NaN or infinity ({_first_offenders(bad)}); flag missing samples instead"
+        raise InputError(wrong)
 
 
 def require_array(name: str, array: Any, shape: tuple[int | None, ...] | None = None) -> None:

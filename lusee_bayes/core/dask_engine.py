@@ -140,9 +140,8 @@ class DaskEngine(engine.Engine):
                 f"the last at {error.last_worker.address} (killed, or out of memory)"
             ) from error
         except (CancelledError, NoWorkerError) as error:
-            raise WorkersLost(
-                "the Dask scheduler has ended, has no workers, or has lost this run"
-            ) from error
+            wrong = "the Dask scheduler has ended, has no workers, or has lost this run"
+            raise WorkersLost(wrong) from error
         finally:
             if self.client.status == "running":
                 self.client.unsubscribe_topic("all")
@@ -224,9 +223,8 @@ def own_workers(n: int, demand: engine.Demand) -> Iterator[distributed.LocalClus
     side_by_side = min(demand.side_by_side, max(1, engine.processors() // n))
     needed = n * demand.process_bytes(side_by_side)
     if needed > memory_limit():
-        raise InputError(
-            f"{n} workers need {gigabytes(needed)} of {gigabytes(memory_limit())}: use fewer"
-        )
+        wrong = f"{n} workers need {gigabytes(needed)} of {gigabytes(memory_limit())}: use fewer"
+        raise InputError(wrong)
     settings = {
         # Dask makes glibc return memory early (MALLOC_TRIM_THRESHOLD_). This also fixes at 128 kB
         # the size above which the system maps and clears new memory for every array, and a channel

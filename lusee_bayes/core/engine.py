@@ -291,9 +291,8 @@ def open_engine(
         yield ThisProcess(demand.side_by_side if demand.process_bytes() <= memory_limit() else 1)
         return
     if find_spec("distributed") is None:
-        raise InputError(
-            "--workers and --cluster need Dask: pip install '.[cluster]' in lusee_bayes's clone"
-        )
+        wrong = "--workers and --cluster need Dask: pip install '.[cluster]' in lusee_bayes's clone"
+        raise InputError(wrong)
     # an optional library, whose import takes a second
     from lusee_bayes.core.dask_engine import connected, own_workers
 

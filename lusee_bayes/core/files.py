@@ -58,9 +58,8 @@ def require_folder(folder: str | Path) -> None:
         # an unnamed file: nothing remains of it, whatever happens
         tempfile.TemporaryFile(dir=place).close()
     except OSError as error:
-        raise InputError(
-            f"cannot write into '{place}': {error.strerror}; give another folder"
-        ) from error
+        wrong = f"cannot write into '{place}': {error.strerror}; give another folder"
+        raise InputError(wrong) from error
 
 
 def require_target(path: str | Path) -> None:
@@ -151,9 +150,8 @@ def locked(folder: Path) -> Iterator[None]:
     except Timeout as error:
         with suppress(FileNotFoundError):
             owner = path.read_text(encoding="utf-8", errors="replace") or owner
-        raise InputError(
-            f"another run uses '{folder}' ({owner}); wait for it to end, or give another folder"
-        ) from error
+        wrong = f"another run uses '{folder}' ({owner}); wait for it to end, or give another folder"
+        raise InputError(wrong) from error
     try:
         path.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
         for scratch in folder.glob(f"{SCRATCH}*"):
@@ -170,9 +168,8 @@ def require_files(folder: Path, names: Sequence[str], command: str) -> None:
         raise InputError(f"'{folder}' is not a folder; give the folder of a finished run")
     for name in names:
         if not (folder / name).is_file():
-            raise InputError(
-                f"'{folder}' has no {name}; give a folder that lusee-bayes {command} made"
-            )
+            wrong = f"'{folder}' has no {name}; give a folder that lusee-bayes {command} made"
+            raise InputError(wrong)
 
 
 def _is_inside(name: str) -> str:
@@ -323,9 +320,8 @@ def require_apart(folder: Path, inputs: Iterable[str | Path]) -> None:
     written = {folder.resolve(), *((folder / name).resolve() for name in names)}
     for path in inputs:
         if user_path(path).resolve() in written:
-            raise InputError(
-                f"'{path}' is an input of this run, which would replace it; give another -o"
-            )
+            wrong = f"'{path}' is an input of this run, which would replace it; give another -o"
+            raise InputError(wrong)
 
 
 @contextmanager

@@ -277,9 +277,8 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable, factor: f
         require_mhz(where, values)
     if declared.grows and not (np.diff(values) > 0).all():
         place = int(np.flatnonzero(~(np.diff(values) > 0))[0])
-        raise InputError(
-            f"{where} does not increase: {values[place + 1]:.12g} follows {values[place]:.12g}"
-        )
+        wrong = f"{where} does not increase: {values[place + 1]:.12g} follows {values[place]:.12g}"
+        raise InputError(wrong)
     return values
 
 

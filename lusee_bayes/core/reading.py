@@ -163,9 +163,8 @@ def read_model(path: str | Path, kind: type[T], what: str, hint: str = "") -> T:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(
-            f"{path} is not {what}: {f'{where}: ' if where else ''}{first['msg']}"
-        ) from error
+        wrong = f"{path} is not {what}: {f'{where}: ' if where else ''}{first['msg']}"
+        raise InputError(wrong) from error
 
 
 def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np.ndarray]:
@@ -184,9 +183,8 @@ def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np
     header, *rows = rows
     for number, row in enumerate(rows, start=2):
         if len(row) != len(header):
-            raise InputError(
-                f"{path}: line {number} has {len(row)} entries for {len(header)} columns"
-            )
+            wrong = f"{path}: line {number} has {len(row)} entries for {len(header)} columns"
+            raise InputError(wrong)
     columns: dict[str, np.ndarray] = {}
     texts = {name for name, column in layout.variables.items() if column.kind == "text"}
     for name, values in zip(header, zip(*rows, strict=True), strict=True):

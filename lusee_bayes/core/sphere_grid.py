@@ -55,9 +55,8 @@ class SphereGrid(eqx.Module):
             If ``band`` is below ``lmax``, since the harmonics are not orthogonal on such a grid.
         """
         if band < lmax:
-            raise InputError(
-                f"a grid of band limit {band} does not support harmonics up to ell = {lmax}"
-            )
+            wrong = f"a grid of band limit {band} does not support harmonics up to ell = {lmax}"
+            raise InputError(wrong)
         x, weights = np.polynomial.legendre.leggauss(band + 1)
         theta, n_phi = np.arccos(x), 2 * band + 2
         # ells, orders, rings

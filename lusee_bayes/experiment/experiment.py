@@ -259,9 +259,8 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
     def require_free(cls: type[Systematic]) -> None:
         if cls.treatment(experiment.scenario) == "marginalised":
-            raise InputError(
-                f"the scenario marginalises this unknown, too; set {cls.key}.treatment=sampled"
-            )
+            wrong = f"the scenario marginalises this unknown, too; set {cls.key}.treatment=sampled"
+            raise InputError(wrong)
 
     def built(cls: type[Systematic]) -> Systematic:
         if cls.treatment(experiment.scenario) is None:

@@ -225,9 +225,8 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
             "noise follows from frames; remove duty_cycle and log_factor_std of noise.radiometer"
         )
     if flight.filter_taps:
-        raise InputError(
-            "channels of simulated spectra have independent noise; set flight.filter_taps to 0"
-        )
+        wrong = "channels of simulated spectra have independent noise; set flight.filter_taps to 0"
+        raise InputError(wrong)
     if step_s < FRAME_S:
         raise InputError(
             f"a frame of the spectrometer lasts {FRAME_S:g} s, but a sample {step_s:g} s; use a "

@@ -231,26 +231,22 @@ class Scenario(Section):
         if self.joint:
             self.spectral.require_channels(len(many))
         if self.sky.sources and own_sources:
-            raise ValueError(
-                "the embedded sky has sources; for your own sources.list set sky.sources=false"
-            )
+            wrong = "the embedded sky has sources; for your own sources.list set sky.sources=false"
+            raise ValueError(wrong)
         if error is not None and error.parameters and not self.beam.has_parameters:
             raise ValueError(
                 "noise.beam.parameters describe the embedded antennas, which beam.file replaces; "
                 "use noise.beam.shift_mhz or noise.beam.file, or a grid of files (beam.model=grid)"
             )
         if (self.beam.is_file or (error is not None and error.file is not None)) and own_sources:
-            raise ValueError(
-                "sources.list needs exact embedded beams; remove beam.file and noise.beam.file"
-            )
+            wrong = "sources.list needs exact embedded beams; remove beam.file and noise.beam.file"
+            raise ValueError(wrong)
         if self.joint and (prior.has_files or prior.surveys or getattr(prior, "scale", 1.0) != 1.0):
-            raise ValueError(
-                "joint uses the spectral prior; remove files, surveys and scale of the prior"
-            )
+            wrong = "joint uses the spectral prior; remove files, surveys and scale of the prior"
+            raise ValueError(wrong)
         if many and prior.has_files and prior.file_frequency_mhz is None:
-            raise ValueError(
-                "files of the prior are for one frequency; give it as prior.file_frequency_mhz"
-            )
+            wrong = "files of the prior are for one frequency; give it as prior.file_frequency_mhz"
+            raise ValueError(wrong)
         return self
 
     @property
@@ -308,9 +304,8 @@ class Scenario(Section):
     def require_marginal(self, what: str, advice: str) -> None:
         """Raise InputError if anything is sampled, for commands that can only marginalise."""
         if self.samples:
-            raise InputError(
-                f"something is to be sampled, but {what} can only marginalise; {advice}"
-            )
+            wrong = f"something is to be sampled, but {what} can only marginalise; {advice}"
+            raise InputError(wrong)
 
     def require_single(self, what: str) -> None:
         """Raise InputError for several frequencies, for commands with one."""
@@ -373,13 +368,11 @@ def _read_yaml(source: str | Path) -> dict[Any, Any]:
     elif str(source) in names:
         tree = parse_yaml(scenario_text(str(source)), str(source))
     elif os.sep in str(source) or Path(source).suffix[1:2].isalpha():
-        raise InputError(
-            f"no scenario file at '{source}'; check the path, or name one of the package"
-        )
+        wrong = f"no scenario file at '{source}'; check the path, or name one of the package"
+        raise InputError(wrong)
     else:
-        raise InputError(
-            f"no scenario '{source}': neither a file nor a name; {nearest(str(source), names)}"
-        )
+        wrong = f"no scenario '{source}': neither a file nor a name; {nearest(str(source), names)}"
+        raise InputError(wrong)
     tree = {} if tree is None else tree
     if not isinstance(tree, dict):
         raise InputError(f"{source} must contain keys and values, got a {type(tree).__name__}")

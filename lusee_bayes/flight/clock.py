@@ -178,9 +178,8 @@ def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: T
         )
     if given is not None and given.stated is not None:
         if said is None:
-            raise InputError(
-                f"{path} contains no UTC of {given.source}: give clocks, not stated_utc_isot"
-            )
+            wrong = f"{path} contains no UTC of {given.source}: give clocks, not stated_utc_isot"
+            raise InputError(wrong)
         since_s = float(times.seconds_from(said.utc(np.array([said.raw_s]))[0], given.stated))
         raw_s = said.raw_s + since_s / said.rate
         return replace(given, raw_s=raw_s, rate=given.rate * said.rate, stated=None)

@@ -176,7 +176,6 @@ def _interpolated_to(where: str, raw_s: Rows, times_s: Times, values: Times) -> 
     # a spectrum is longer than the telemetry's step, so its ends may lack half a step
     slack = 2.0 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     if not len(times_s) or raw_s[0] < times_s[0] - slack or raw_s[-1] > times_s[-1] + slack:
-        raise InputError(
-            f"{where} does not cover the spectra; ingest the session with its telemetry"
-        )
+        wrong = f"{where} does not cover the spectra; ingest the session with its telemetry"
+        raise InputError(wrong)
     return np.interp(raw_s, times_s, values)

@@ -334,9 +334,8 @@ def session_of(path: Path, parsed: Content, arrays: Mapping[str, Unread], **othe
         If counts or gains are invalid.
     """
     if not parsed.values["spectra/data.bitslice_restored"]:
-        raise InputError(
-            f"{path}: bit slices of spectra/data are not restored; ingest it again with luseepy"
-        )
+        wrong = f"{path}: bit slices of spectra/data are not restored; ingest it again with luseepy"
+        raise InputError(wrong)
     rows, cube = parsed.arrays, arrays["spectra/data"]
     n = parsed.sizes["row"]
     if tuple(cube.shape) != (n, 16, N_CHANNELS) or np.dtype(cube.dtype).kind != "f":

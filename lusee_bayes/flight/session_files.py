@@ -67,9 +67,8 @@ def read_session(path: str | Path) -> Session:
 def _version_of(path: Path, version: Any) -> int:
     """Return the version of a layout; InputError if this package does not read it."""
     if version is None:
-        raise InputError(
-            f"{path} has no layout_version; expected a session of luseepy's lusee.ingest"
-        )
+        wrong = f"{path} has no layout_version; expected a session of luseepy's lusee.ingest"
+        raise InputError(wrong)
     if (number := int(version)) < 3:
         raise InputError(
             f"{path} is of layout {number}, without restored bit slices; ingest the session again "

@@ -206,9 +206,8 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     bin_of = bins_of(observation, to_s)
     kept, used = by_the_rule(np.asarray(data.layout.present), bin_of, live_s)
     if not used.any():
-        raise InputError(
-            f"averages over {to_s:g} s leave no data: products share no samples; average less"
-        )
+        wrong = f"averages over {to_s:g} s leave no data: products share no samples; average less"
+        raise InputError(wrong)
     # renumber the bins that are not empty
     bins, bin_of_left = np.unique(bin_of[used], return_inverse=True)
     weight = live_s[used] / np.bincount(bin_of_left, live_s[used])[bin_of_left]

@@ -462,9 +462,8 @@ def site_of(site: Any) -> tuple[float, float]:
     if isinstance(site, str):
         sites = {name.lower(): place for name, place in SITES.items()}
         if site.lower() not in sites:
-            raise InputError(
-                f"unknown site '{site}'; {nearest(site, SITES)} (or give two angles in degrees)"
-            )
+            why = f"unknown site '{site}'; {nearest(site, SITES)} (or give two angles in degrees)"
+            raise InputError(why)
         return sites[site.lower()]
     wrong = f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
     with refusing(wrong, TypeError, ValueError):

@@ -179,9 +179,8 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
         imaginary = np.abs(values.imag) > AUTO_TOLERANCE * np.abs(values.real)
         if i == j and (imaginary & ~gone).any():
             k = int(np.argmax(imaginary & ~gone))
-            raise InputError(
-                f"the auto {pair} is {values[k]:.6g} at time {k}, not real; check the names"
-            )
+            wrong = f"the auto {pair} is {values[k]:.6g} at time {k}, not real; check the names"
+            raise InputError(wrong)
         parts = {part: values} if part else {"R": values.real, "I": values.imag}
         for name, numbers in parts.items():
             if i != j or name == "R":
@@ -195,9 +194,8 @@ def _numbers(data: Any) -> np.ndarray:
         data = np.asarray(data)
         data = data.astype(np.complex128 if np.iscomplexobj(data) else np.float64)
     except (ValueError, TypeError) as error:
-        raise InputError(
-            f"the data are not an array of numbers: {error}; give (times, products), in K"
-        ) from error
+        wrong = f"the data are not an array of numbers: {error}; give (times, products), in K"
+        raise InputError(wrong) from error
     if data.ndim != 2 or not data.size:
         raise InputError(f"the data have shape {data.shape}, expected (times, products)")
     return data
@@ -218,9 +216,8 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
             raise InputError(f"unknown product '{name}'; name the two ports, such as {example}")
         i, j, part = int(match[1]), int(match[2]), match[3].upper()
         if max(i, j) >= n_antennas:
-            raise InputError(
-                f"the product '{name}' has port {max(i, j)}, beyond n_antennas = {n_antennas}"
-            )
+            wrong = f"the product '{name}' has port {max(i, j)}, beyond n_antennas = {n_antennas}"
+            raise InputError(wrong)
         if is_complex and part:
             raise InputError(f"the data are complex; replace '{name}' by its ports, '{i}{j}'")
         if not is_complex and not part and i != j:
@@ -238,9 +235,8 @@ def _flags(flags: Any, shape: tuple[int, ...]) -> np.ndarray:
     if flags.dtype.kind not in "biu" or not np.isin(flags, (0, 1)).all():
         raise InputError("flags must be true or false; give true where samples are not used")
     if flags.shape not in (shape, shape[:1]):
-        raise InputError(
-            f"flags have shape {flags.shape}, expected {shape} as the data, or {shape[:1]}"
-        )
+        wrong = f"flags have shape {flags.shape}, expected {shape} as the data, or {shape[:1]}"
+        raise InputError(wrong)
     return (flags if flags.ndim == 2 else flags[:, None]).astype(bool)
 
 

@@ -93,9 +93,8 @@ def require_ephemeris(jd: Times) -> None:
     if 0.0 < at < 5373484.0:  # years of four digits
         with unannounced_leap_seconds():
             date = Time(at, format="jd").isot[:19]
-    raise InputError(
-        f"{date} is outside the ephemeris, {EPHEMERIS_YEARS[0]} to {EPHEMERIS_YEARS[1]}"
-    )
+    wrong = f"{date} is outside the ephemeris, {EPHEMERIS_YEARS[0]} to {EPHEMERIS_YEARS[1]}"
+    raise InputError(wrong)
 
 
 def utc_of(jd1: Times, jd2: Times, scale: str = "utc") -> Time:
@@ -225,9 +224,8 @@ class Windows(Described):
     def __post_init__(self):
         require_shape("sample of the windows", self.sample, (None,))
         if not counts_up(self.sample):
-            raise InputError(
-                "pieces of windows must count the samples 0, 1, ..., at least one piece for each"
-            )
+            why = "pieces of windows must count the samples 0, 1, ..., at least one piece for each"
+            raise InputError(why)
         for name in ("start_s", "end_s", "live_s"):
             require_shape(f"{name} of the windows", getattr(self, name), self.sample.shape)
             require_finite(f"{name} of the windows", getattr(self, name))

@@ -90,9 +90,8 @@ def read_windows(content: Content, times: Time) -> tuple[Time, Windows | None]:
     given = [name for name in (*PIECES, "time_bounds", "live_time") if name in arrays]
     lost = [name for name in PIECES if name not in arrays]
     if said == "instant" and given:
-        raise InputError(
-            f"the attribute window declares instants, but {given[0]} gives windows; remove one"
-        )
+        wrong = f"the attribute window declares instants, but {given[0]} gives windows; remove one"
+        raise InputError(wrong)
     if 0 < len(lost) < len(PIECES):
         raise InputError(f"{given[0]} without {lost[0]}; pieces of windows need both")
     if not lost:
@@ -276,9 +275,8 @@ class Visibilities(checks.Described):
         values = real_products(data, products, flags, convention, n_antennas)
         utc = utc_times(times)
         if len(utc) != values.shape[1]:
-            raise InputError(
-                f"got {len(utc)} times for data of {values.shape[1]} times (their first axis)"
-            )
+            wrong = f"got {len(utc)} times for data of {values.shape[1]} times (their first axis)"
+            raise InputError(wrong)
         checks.require_shape("frequency_mhz", np.asarray(frequency_mhz), ())
         checks.require_positive("frequency_mhz", frequency_mhz)
         require_mhz("frequency_mhz", frequency_mhz)

@@ -396,9 +396,8 @@ def write_waterfall(
         )
     data, seconds = _kelvin(path, channels), times.seconds_from(first.times[0], first.times)
     if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > times.ROUNDING_S:
-        raise InputError(
-            f"{path}: luseepy's waterfalls need samples every {first.step_s:g} s; {HINT}"
-        )
+        wrong = f"{path}: luseepy's waterfalls need samples every {first.step_s:g} s; {HINT}"
+        raise InputError(wrong)
     pairs = np.array([(p.i, p.j) for p in products.all_products() if p.part == "R"])
     z = np.full(len(channels), np.nan + 1j * np.nan) if impedance_ohm is None else impedance_ohm
     mhz = np.array([channel.frequency_mhz for channel in channels])

@@ -496,9 +496,8 @@ class Whitened(Form):
         solver = cls(model, *cls._factorised(model))
         if not is_traced(solver.lower) and not np.isfinite(np.diagonal(solver.lower)).all():
             model.noise.factor()  # outside jit: raises and names the term that is not positive
-            raise InputError(
-                "Lambda has no Cholesky factor: the data are too precise; use form=InData"
-            )
+            wrong = "Lambda has no Cholesky factor: the data are too precise; use form=InData"
+            raise InputError(wrong)
         return solver
 
     @staticmethod

@@ -160,9 +160,8 @@ class Covariance(checks.Described, eqx.Module):
 
     def __add__(self, other: Covariance) -> Covariance:
         if self.size != other.size:
-            raise InputError(
-                f"cannot add covariances of {self.size} and {other.size} data; build both alike"
-            )
+            wrong = f"cannot add covariances of {self.size} and {other.size} data; build both alike"
+            raise InputError(wrong)
         total = self.absorb(other)
         total = other.absorb(self) if total is None else total
         if total is None:

@@ -54,9 +54,8 @@ def sky_frequency_mhz(path: str | Path) -> float:
     path = reading.require_file(path, "sky map")
     match = re.search(r"exp(\d+(?:\.\d+)?)MHz", Path(path).name)
     if match is None or float(match[1]) == 0.0:
-        raise InputError(
-            f"'{Path(path).name}' states no frequency; name it as exp10.0MHz_sky_map.hdf5"
-        )
+        wrong = f"'{Path(path).name}' states no frequency; name it as exp10.0MHz_sky_map.hdf5"
+        raise InputError(wrong)
     return float(match[1])
 
 

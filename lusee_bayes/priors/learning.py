@@ -358,9 +358,8 @@ def _climb(family: PriorFamily, information: Information, base: _Point, step: Pa
             trial = _at(family, information, base.parameters + part * step)
             if trial.value >= base.value - SETTLED / 10.0:
                 return trial
-    raise InputError(
-        "the prior's parameters do not converge: ln p decreases along its gradient, by rounding"
-    )
+    wrong = "the prior's parameters do not converge: ln p decreases along its gradient, by rounding"
+    raise InputError(wrong)
 
 
 def _root(covariance: Square) -> Float[np.ndarray, "n k"]:

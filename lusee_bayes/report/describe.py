@@ -137,9 +137,8 @@ def describe_folder(folder: Path) -> list[str]:
     recover(folder)
     manifest = read_manifest(folder)
     if manifest is None:
-        raise InputError(
-            f"'{folder}' is not the folder of a run: no manifest.json; give a file or a folder"
-        )
+        wrong = f"'{folder}' is not the folder of a run: no manifest.json; give a file or a folder"
+        raise InputError(wrong)
     lines = [f"results of lusee-bayes {manifest['kind']}"]
     provenance = "lusee_bayes.results.finished_runs:Provenance"
     if "provenance.json" in manifest["files"]:

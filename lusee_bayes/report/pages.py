@@ -186,9 +186,8 @@ def write_report(folder: str | Path) -> Path:
     manifest = read_manifest(folder)
     kind = manifest and manifest["kind"]
     if kind not in PAGES:
-        raise InputError(
-            f"'{folder}' has no results of map, sample or validate; give that of a finished run"
-        )
+        wrong = f"'{folder}' has no results of map, sample or validate; give that of a finished run"
+        raise InputError(wrong)
     path = folder / REPORT
     with replacing(path) as partial:
         partial.write_text(PAGES[kind](folder, folder.resolve().name), encoding="utf-8")

@@ -209,9 +209,8 @@ class SavedInformation:
             If they are already included.
         """
         if digest in self.digests:
-            raise InputError(
-                "the earlier posterior already includes these data; give only new ones"
-            )
+            wrong = "the earlier posterior already includes these data; give only new ones"
+            raise InputError(wrong)
         return information + self.information
 
 
@@ -455,9 +454,8 @@ class FinishedRun:
     def sky_spectrum(self) -> SkySpectrum:
         """The spectrum of the sky. InputError for one channel."""
         if len(self.channels) == 1:
-            raise InputError(
-                f"'{self.name}' has one frequency; make a map with --frequencies 5:50:1"
-            )
+            wrong = f"'{self.name}' has one frequency; make a map with --frequencies 5:50:1"
+            raise InputError(wrong)
         return spectrum_of(self.channels)
 
     @classmethod
@@ -479,9 +477,8 @@ def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
         if run.name in [other.name for other in runs[:number]]:
             raise InputError(f"two of the folders are named '{run.name}'; rename one of them")
         if len(run.channels) > 1 or run.channel.judged is None:
-            raise InputError(
-                f"'{run.name}' has several frequencies; give folders of single-frequency maps"
-            )
+            wrong = f"'{run.name}' has several frequencies; give folders of single-frequency maps"
+            raise InputError(wrong)
     return runs
 
 

@@ -131,9 +131,8 @@ def signal_limit(
     x = np.log(f / np.sqrt(f.min() * f.max())) / np.log(np.sqrt(f.max() / f.min()))
     t, y = template(f), spectrum.temperature[k]
     if not np.isfinite(t).all() or np.abs(t).max() < FAINT:
-        raise InputError(
-            f"{name}: the template vanishes or is not finite at {f.min():g} to {f.max():g} MHz"
-        )
+        wrong = f"{name}: the template vanishes or is not finite at {f.min():g} to {f.max():g} MHz"
+        raise InputError(wrong)
     if not (np.isfinite(y) & (y > 0.0)).all():
         raise InputError(f"the {region} has temperatures that are not positive")
     linalg.checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
@@ -208,9 +207,8 @@ def named_template(text: str) -> tuple[str, Callable[[Frequencies], arrays.Vecto
         name = f"trough at {centre:g} MHz, {width:g} MHz wide"
         return name, lambda f: -np.exp(-0.5 * ((f - centre) / width) ** 2)
     if not Path(text).is_file():
-        raise InputError(
-            f"no template '{text}'; give trough:MHZ:WIDTH, excess, constant or a CSV file"
-        )
+        wrong = f"no template '{text}'; give trough:MHZ:WIDTH, excess, constant or a CSV file"
+        raise InputError(wrong)
     table = reading.read_table(Path(text), TABLE)
     mhz, kelvin = table["frequency_mhz"], table["temperature_k"]
     shape = kelvin / (np.abs(kelvin).max() or 1.0)

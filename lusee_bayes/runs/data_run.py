@@ -385,9 +385,8 @@ def run_average(
     scenario = load_scenario(scenario)
     stages, path = stages or Stages(), user_path(path)
     if path.suffix == ".fits":
-        raise InputError(
-            f"'{path}': luseepy's waterfalls cannot store windows; give -o a name without .fits"
-        )
+        wrong = f"'{path}': luseepy's waterfalls cannot store windows; give -o a name without .fits"
+        raise InputError(wrong)
     require_new(path, replace=replace, inputs=inputs_of(scenario, data))
     scenario.require_single("averages have")
     scenario = scenario.with_section("observation", average_s=None)

@@ -611,9 +611,8 @@ class _Run:
         latent = programs.latent_sites(program, arguments)
         white = set() if whitening is None else set(whitening.names)
         if unknown := white - set(latent):
-            raise InputError(
-                f"the program has no latent site '{min(unknown)}'; it has {', '.join(latent)}"
-            )
+            wrong = f"the program has no latent site '{min(unknown)}'; it has {', '.join(latent)}"
+            raise InputError(wrong)
         self.sampler = sampler
         # arrays in the model's arguments are traced, everything else is static
         self.dynamic, static = eqx.partition((whitening, arguments), eqx.is_array)

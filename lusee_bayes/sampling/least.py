@@ -22,6 +22,5 @@ def require_simulations(n: int) -> None:
 def require_draws(n: int) -> None:
     """Raise InputError if a chain has fewer draws than a comparison needs."""
     if n < LEAST_DRAWS:
-        raise InputError(
-            f"a comparison needs {LEAST_DRAWS} draws of each chain, got {n}; raise --draws"
-        )
+        wrong = f"a comparison needs {LEAST_DRAWS} draws of each chain, got {n}; raise --draws"
+        raise InputError(wrong)

@@ -155,9 +155,8 @@ def load_program(source: str | Path) -> Program:
         exec(compile(text, printable(str(path)), "exec", dont_inherit=True), module.__dict__)
     model = getattr(module, "model", None)
     if not callable(model):
-        raise InputError(
-            f"'{path}' has no function 'model'; a program is def model(..., data=None)"
-        )
+        wrong = f"'{path}' has no function 'model'; a program is def model(..., data=None)"
+        raise InputError(wrong)
     asked, pieces = inspect.signature(model).parameters, [*PIECES, *EXPERIMENT_PIECES]
     for name, argument in asked.items():
         if argument.kind not in (argument.POSITIONAL_OR_KEYWORD, argument.KEYWORD_ONLY):
@@ -166,9 +165,8 @@ def load_program(source: str | Path) -> Program:
                 "passed by name: def model(coupling, prior, noise, data=None)"
             )
         if name != DATA and name not in pieces:
-            raise InputError(
-                f"model in '{path}' asks for '{name}', not a piece; {nearest(name, pieces)}"
-            )
+            wrong = f"model in '{path}' asks for '{name}', not a piece; {nearest(name, pieces)}"
+            raise InputError(wrong)
     if DATA not in asked or asked[DATA].default is not None:
         raise InputError(
             f"model in '{path}' has no argument 'data' with default None; write data=None: given "
@@ -327,9 +325,8 @@ def require_sampleable(
     with _blaming(who, "when it is called with data=None"):
         drawn = latent_sites(program.model, {**arguments, DATA: None})
     if DATA not in drawn:
-        raise InputError(
-            f"{who} draws no data if data=None; sample('data', ..., obs=data) in both cases"
-        )
+        wrong = f"{who} draws no data if data=None; sample('data', ..., obs=data) in both cases"
+        raise InputError(wrong)
     if differing := {*drawn} ^ {*latent, DATA}:
         raise InputError(
             f"{who} samples '{min(differing)}' only with data, or only without; sample it in both"
@@ -359,9 +356,8 @@ def _blaming(who: str, doing: str) -> Iterator[None]:
 
 def _require_site(name: str, site: dict[str, Any], latent: bool, who: str) -> None:
     if not NAME.fullmatch(name):
-        raise InputError(
-            f"{who} has a site '{name}'; use letters, digits, '_', '.' and '-', a letter first"
-        )
+        wrong = f"{who} has a site '{name}'; use letters, digits, '_', '.' and '-', a letter first"
+        raise InputError(wrong)
     if name in TAKEN or name.endswith(WHITE_SUFFIX):
         raise InputError(f"{who} has a site '{name}', a reserved name; rename it")
     if latent and site["fn"].support.is_discrete:

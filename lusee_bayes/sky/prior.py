@@ -365,9 +365,8 @@ class HarmonicPrior(DiagonalPrior):
     def require_density(self) -> None:
         if not is_traced(self.spectrum) and not np.asarray(self.spectrum).all():
             ell = int(np.argmin(np.asarray(self.spectrum)))
-            raise InputError(
-                f"the prior spectrum is zero at ell = {ell} and has no density; drop that ell"
-            )
+            wrong = f"the prior spectrum is zero at ell = {ell} and has no density; drop that ell"
+            raise InputError(wrong)
 
 
 SPECTRUM = Layout(

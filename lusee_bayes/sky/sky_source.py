@@ -255,9 +255,8 @@ def _is_unseen(pixels: np.ndarray) -> Bool[np.ndarray, "..."]:
 def _read_map(path: Path) -> np.ndarray:
     with opened(path) as hdus:
         if not (tables := [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]):
-            raise InputError(
-                f"{path} has no binary table; expected a HEALPix FITS map (or ULSA HDF5)"
-            )
+            wrong = f"{path} has no binary table; expected a HEALPix FITS map (or ULSA HDF5)"
+            raise InputError(wrong)
         header = tables[0].header
         listed = str(header.get("INDXSCHM")).strip().upper() == "EXPLICIT"
         column = tables[0].columns[int(listed)]
@@ -350,9 +349,8 @@ class SkyAlms(SkyFile):
             arrays = read_arrays(path, NPZ, "check sky.file").arrays
             frequencies, alm = arrays["freq"], arrays["alm"]
             if healpy.Alm.getlmax(alm.shape[1]) < 0:
-                raise InputError(
-                    f"{path}: alm has {alm.shape[1]} values, expected (lmax + 1) (lmax + 2) / 2"
-                )
+                wrong = f"{path}: alm has {alm.shape[1]} values, expected (lmax + 1) (lmax + 2) / 2"
+                raise InputError(wrong)
         else:
             frequencies, alm = None, _read_alm_fits(path)
         return cls(str(path), frequencies, harmonics.from_healpy(np.atleast_2d(alm)))

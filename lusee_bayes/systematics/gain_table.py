@@ -92,9 +92,8 @@ class GainTable(Systematic):
         std, calibration = section.std, setup.calibration
         named = calibration is not None and calibration.gain_slope is not None
         if named and std is not None:
-            raise InputError(
-                "the data contain the errors of their gain table; remove noise.gain_table.std"
-            )
+            wrong = "the data contain the errors of their gain table; remove noise.gain_table.std"
+            raise InputError(wrong)
         if not named:
             if std is None and setup.scenario.flight is not None:
                 # it applies to every level of every port: these data have one level

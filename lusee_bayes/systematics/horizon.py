@@ -177,9 +177,8 @@ class Horizon(ChangedBeams):
         azimuth = np.pi / 2.0 - ahead - 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
         altitude = section.altitude_at(azimuth)
         if section.treatment != "ignored" and not altitude.any():
-            raise InputError(
-                f"{section.file} has altitude 0 everywhere; raise noise.horizon.altitude_deg"
-            )
+            wrong = f"{section.file} has altitude 0 everywhere; raise noise.horizon.altitude_deg"
+            raise InputError(wrong)
         highest = min(float(altitude.max() + np.radians(REACH * section.std_deg)), np.pi / 2.0)
         # polynomials that follow the patterns, and the harmonics: lmax radians per radian
         grids = _rings(24 + int(highest * beams.lmax), highest), whole

@@ -103,9 +103,8 @@ class PriorSpectrum(Scale):
             If the prior has no C_ell, or a band begins above its highest ell.
         """
         if not isinstance(model.prior, HarmonicPrior):
-            raise InputError(
-                f"a sampled spectrum needs a HarmonicPrior, got {type(model.prior).__name__}"
-            )
+            wrong = f"a sampled spectrum needs a HarmonicPrior, got {type(model.prior).__name__}"
+            raise InputError(wrong)
         spectrum = model.prior.spectrum
         ell = np.arange(spectrum.shape[0])
         if self.edges:

@@ -110,9 +110,8 @@ class HemisphereGrid(eqx.Module):
         """
         checks.require_shape("the field", f, (*f.shape[:-2], len(self.theta), self.n_phi))
         if self.n_phi <= 2 * lmax:
-            raise InputError(
-                f"{self.n_phi} azimuths cannot resolve lmax = {lmax}; give more than {2 * lmax}"
-            )
+            wrong = f"{self.n_phi} azimuths cannot resolve lmax = {lmax}; give more than {2 * lmax}"
+            raise InputError(wrong)
         ell, m = mode_numbers(lmax)
         xp = namespace(f)
         fourier = xp.fft.rfft(f, axis=-1)[..., : lmax + 1] * (2.0 * np.pi / self.n_phi)

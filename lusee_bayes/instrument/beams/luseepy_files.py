@@ -386,9 +386,8 @@ def read_response(path: str | Path) -> PortResponse:
     frequencies, theta_deg, phi_deg = (images[name] for name in AXES)
     for name, degrees, last in (("theta", theta_deg, 90.0), ("phi", phi_deg, 360.0)):
         if not np.allclose(degrees, np.linspace(0.0, last, len(degrees)), rtol=0, atol=1e-9):
-            raise InputError(
-                f"{path}: {name} goes {degrees[0]:g} to {degrees[-1]:g}, expected 0 to {last:g}"
-            )
+            wrong = f"{path}: {name} goes {degrees[0]:g} to {degrees[-1]:g}, expected 0 to {last:g}"
+            raise InputError(wrong)
     complex_ = {n: images[f"{n}_real"] + 1j * images[f"{n}_imag"] for n in (*LENGTHS, *MATRICES)}
     # the last azimuth repeats the first
     h_theta, h_phi = (np.moveaxis(complex_[name], 0, 1)[..., :-1] for name in LENGTHS)
@@ -396,9 +395,8 @@ def read_response(path: str | Path) -> PortResponse:
     resistance = (impedance + impedance.conj().swapaxes(1, 2)) / 2.0
     off = np.abs(sky + moon + loss - resistance).max() / np.abs(resistance).max()
     if off > RESISTANCE_TOLERANCE:
-        raise InputError(
-            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2 by a relative {off:.1g}"
-        )
+        wrong = f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2 by a relative {off:.1g}"
+        raise InputError(wrong)
     theta = np.linspace(0.0, np.pi / 2.0, len(theta_deg))
     return PortResponse(str(path), frequencies, theta, h_theta, h_phi, impedance, moon, loss)
 

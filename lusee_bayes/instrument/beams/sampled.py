@@ -137,9 +137,8 @@ class Directions:
             theta, _ = healpy.pix2ang(self.nside, np.arange(values.shape[-1]))
             kept = np.where(theta < np.pi / 2.0, values, 0.0)
         if (bad := ~np.isfinite(kept)).any():
-            raise InputError(
-                f"{what} contains NaN or infinity in {bad.sum()} of {bad.size} directions"
-            )
+            wrong = f"{what} contains NaN or infinity in {bad.sum()} of {bad.size} directions"
+            raise InputError(wrong)
         return kept
 
     def quadrature(self, lmax: int) -> HemisphereGrid:
@@ -266,9 +265,8 @@ class SampledBeams(Described, BeamSource):
         if not self.absolute if self.normalise is None else self.normalise:
             scale = float(grid.integrate(patterns[auto_indices(self.n_ports)]).mean())
             if not scale > 0.0:
-                raise InputError(
-                    f"{self.path}: the autos integrate to {scale:g} sr on average; expected > 0"
-                )
+                wrong = f"{self.path}: the autos integrate to {scale:g} sr on average; expected > 0"
+                raise InputError(wrong)
             patterns = patterns / scale
         return ProductBeams(grid.modes(patterns, lmax), float(frequency_mhz))
 
@@ -490,9 +488,8 @@ def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam")
         :func:`sampled_beams`.
     """
     if beam.beam_type != "efield":
-        raise InputError(
-            f"{path} is a UVBeam of type {beam.beam_type}; crosses need fields, type efield"
-        )
+        wrong = f"{path} is a UVBeam of type {beam.beam_type}; crosses need fields, type efield"
+        raise InputError(wrong)
     if (system := beam.pixel_coordinate_system) not in ("az_za", "healpix"):
         raise InputError(f"{path} has coordinates {system}; expected az_za or healpix")
     basis = np.asarray(beam.basis_vector_array)

@@ -462,6 +462,5 @@ class BeamSource(ABC):
     @property
     def monopoles(self) -> BeamSource:
         """The embedded antennas; InputError if the beams come from a file."""
-        raise InputError(
-            "this needs the embedded antennas, which beam.file replaces; remove beam.file"
-        )
+        wrong = "this needs the embedded antennas, which beam.file replaces; remove beam.file"
+        raise InputError(wrong)
