@@ -50,12 +50,10 @@ class ChannelCouplings(Coupling):
         return self.mixing @ maps.reshape(self.mixing.shape[1], -1)
 
     def _matrix(self):
-        pairs = zip(self.mixing, self.matrices, strict=True)
-        return jnp.concatenate([jnp.kron(weights[None], matrix) for weights, matrix in pairs])
+        return jnp.concatenate([*map(jnp.kron, self.mixing[:, None], self.matrices)])
 
     def _forward(self, sky):
-        pairs = zip(self.matrices, self.skies(sky), strict=True)
-        return jnp.concatenate([matrix @ one for matrix, one in pairs])
+        return jnp.concatenate([*map(jnp.matmul, self.matrices, self.skies(sky))])
 
     def _backward(self, data):
         return self._matrix().T @ data
@@ -99,10 +97,7 @@ class JointModel(eqx.Module):
 
     @classmethod
     def of(
-        cls,
-        models: Sequence[LinearGaussian],
-        data: Sequence[Float[Array, " _"]],
-        prior: SpectralPrior,
+        cls, models: Sequence[LinearGaussian], data: Sequence[Array], prior: SpectralPrior
     ) -> JointModel:
         """Combine channels.
 

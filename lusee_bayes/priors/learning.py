@@ -408,9 +408,8 @@ def _learned(
             shift = float(np.clip(shift, LEVELS[0] - 1.0, LEVELS[-1] + 1.0))
         prior = at_level(shift).prior
     except InputError:  # too uncertain to be averaged: the most probable values
-        prior, still = point.posterior.prior, FIXED**2 * np.eye(len(mean))
+        prior, shift, still = point.posterior.prior, 0.0, FIXED**2 * np.eye(len(mean))
         scores = Scores(family.hyperprior.scores(point.parameters), still, scores.log_gain)
-        return Learned(prior, point.parameters, covariance, scores, evidence)
     moved = shift * first / family.hyperprior.slopes_of_scores(scores.mean)[0]
     scores = replace(scores, mean=scores.mean + moved)
     return Learned(prior, point.parameters, covariance, scores, evidence)

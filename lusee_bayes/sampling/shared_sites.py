@@ -168,9 +168,7 @@ class _Channel(Messenger):
             return
         name, prior = msg["name"], msg["fn"]
         msg["name"] = site_in(self.channel, name)
-        if name == DATA and self.shared.skies is not None:
-            msg["stop"] = True
-            return
+        msg["stop"] = name == DATA and self.shared.skies is not None
         if msg["type"] != "sample" or name not in self.shared.octaves:
             return
         octaves, before = self.shared.octaves[name], self.site_values.setdefault(name, {})
