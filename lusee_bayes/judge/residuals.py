@@ -149,11 +149,11 @@ class Residuals:
             advice = TOO_WIDE if self.split.prior.too_small else TOO_NARROW
             sky = f"The sky is {self.split.prior.of_sky} ({prior}); instrument and noise fit "
             return Fit(level, " ".join(filter(None, [f"{sky}({instrument}).", strengths, advice])))
-        off = self.extremes()
-        small = self.split.instrument.too_small and all(one.chi2 < one.degrees for one in off)
+        whole = stands_out(self.split.instrument.p, self.n_tests)
+        quiet = all(one.chi2 < one.degrees for one in self.extremes())
+        small = whole and quiet and self.split.instrument.too_small
         why = "The noise is smaller than assumed" if small else "No sky explains these data"
-        if not stands_out(self.split.instrument.p, self.n_tests):
-            why = "As a whole, the data fit"
+        why = why if whole else "As a whole, the data fit"
         blame = [] if small else self._blame(truncated)
         return Fit(level, " ".join([f"{why} ({instrument}).", *blame]))
 

@@ -143,6 +143,14 @@ def test_a_prior_that_is_too_wide_is_told_from_one_that_is_too_narrow(width, sai
     assert learned.level() == ("consistent" if width > 1.0 else "unlike the prior")
 
 
+def test_a_quiet_group_is_named_although_the_whole_fits():
+    found = judged(*simulated())
+    first, *others = found.groups
+    quiet = replace(first, chi2=0.1 * first.degrees, p=1e-12)
+    text = replace(found, groups=(quiet, *others)).fit().text
+    assert "As a whole, the data fit" in text and str(quiet) in text
+
+
 def test_weights_that_rounding_makes_indefinite_have_no_roots():
     weights = np.array([np.eye(2), [[1.0, 2.0], [2.0, 1.0]]])
     found = roots(weights, np.ones((2, 2), dtype=bool))
