@@ -266,7 +266,7 @@ def about_sky_above(setup: Setup) -> list[str]:
     ]
 
 
-def reach(experiment: Experiment, inference: Inference) -> list[str]:
+def reach(experiment: Experiment, inference: Inference, alone: bool = True) -> list[str]:
     """Doubts about the Gaussian, and errors that data would not reveal, one sentence each.
 
     Parameters
@@ -274,10 +274,12 @@ def reach(experiment: Experiment, inference: Inference) -> list[str]:
     experiment : Experiment
     inference : Inference
         Inference from its data.
+    alone : bool
+        Whether it is the only channel; of several, only doubts about the errors are listed.
     """
     sentences, setup = [], experiment.setup
     k, moved_by = weighed(setup, np.asarray(experiment.data.data), inference) or (0.0, 0.0)
-    if k > LARGEST_K or moved_by >= LARGEST_MOVE:
+    if moved_by >= LARGEST_MOVE or (alone and k > LARGEST_K):
         keys = ", ".join(dict.fromkeys(part.systematic.key for part in inference.moving))
         holds = "its errors are valid" if moved_by < LARGEST_MOVE else "its errors are not valid"
         sentences.append(
@@ -286,7 +288,7 @@ def reach(experiment: Experiment, inference: Inference) -> list[str]:
             f"weights of draws have Pareto k = {k:.2g} (accepted: {LARGEST_K:g}). Thus {holds}; "
             "treatment=sampled needs no Gaussian."
         )
-    if setup.measured:
+    if alone and setup.measured:
         spots = blind_spots(setup, inference, inference.posterior.mean)
         sentences += filter(None, [blind_sentence(spots)])
     return sentences

@@ -281,9 +281,8 @@ class Conditioned:
         doubtful = list(doubts(experiment, inference))
         if left is not None:
             doubtful += about_sky_above(experiment.setup)
-        if alone:
-            with stages("first order"):
-                doubtful += reach(experiment, inference)
+        with stages("first order"):
+            doubtful += reach(experiment, inference, alone)
         fitting = experiment.fitting
         altitude = measures.highest_altitude(data.observation, scenario.map_nside)
         if not joint:

@@ -129,7 +129,10 @@ def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them(monke
     assert "its errors are not valid" in validity.reach(experiment, first)[0]
     # a few draws may miss where the Gaussian is wrong: even weights are not sufficient
     monkeypatch.setattr(validity, "weighed", lambda *_: (0.1, 2.0 * validity.LARGEST_MOVE))
-    assert "its errors are not valid" in validity.reach(experiment, found)[0]
+    assert "its errors are not valid" in validity.reach(experiment, found, alone=False)[0]
+    # of several channels, those whose errors are valid say nothing
+    monkeypatch.setattr(validity, "weighed", lambda *_: (np.inf, 0.1))
+    assert validity.reach(experiment, found) and not validity.reach(experiment, found, alone=False)
 
 
 def test_nothing_is_weighed_where_nothing_was_found_in_rounds(plain):
