@@ -389,6 +389,8 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
         notes.append(
             f"The prior, but not the map, uses N times {learned.noise_factor:.2g}, to match chi2."
         )
+    if learned is not None and not learned.averaged:
+        notes.append("The prior has its most probable parameters, too uncertain to be averaged.")
     for name, gain in () if learned is None else learned.survey_gains:
         if gain < 0.0:
             notes.append(

@@ -186,14 +186,12 @@ ROUNDING_S = 1e-6
 EYE_S = 0.01
 
 
-PIECES_ADVICE = "change both, or omit the variables of the pieces"
-
-
-def require_same_times(what: str, off_s: Times, advice: str) -> None:
+def require_same_times(what: str, off_s: Times, omitted: str) -> None:
     """Raise InputError if two statements on the same times differ by more than ``EYE_S``."""
     if (off_s > EYE_S).any():
-        first = int(np.argmax(off_s > EYE_S))
-        raise InputError(f"{what} of sample {first} differ by {off_s[first]:g} s; {advice}")
+        k = int(np.argmax(off_s > EYE_S))
+        wrong = f"{what} of sample {k} differ by {off_s[k]:g} s; change both, or omit {omitted}"
+        raise InputError(wrong)
 
 
 @dataclass(frozen=True, repr=False)
@@ -319,10 +317,10 @@ class Windows(Described):
         if bounds is not None:
             seconds = seconds_from(times[:, None], utc_bounds(bounds, len(times)))
             off = np.abs(seconds - self.bounds_s).max(axis=1)
-            require_same_times("time_bounds and the pieces", off, PIECES_ADVICE)
+            require_same_times("time_bounds and the pieces", off, "the variables of the pieces")
         if live_s is not None:
             off = np.abs(live_s - self.live_per_sample_s)
-            require_same_times("live_time and the pieces", off, PIECES_ADVICE)
+            require_same_times("live_time and the pieces", off, "the variables of the pieces")
 
     def select(self, keep: Bool[np.ndarray, " samples"]) -> Windows:
         """Return the windows of the samples where ``keep`` is True."""

@@ -480,7 +480,7 @@ def read_visibilities(path: str | Path) -> Visibilities:
         times = _utc_of_jd(content)
         if "time" in arrays:
             off = np.abs(at.seconds_from(times, utc_times(arrays["time"])))
-            at.require_same_times("time and jd1 + jd2", off, "change both, or omit time")
+            at.require_same_times("time and jd1 + jd2", off, "time")
         times, windows = read_windows(content, times)
         says_window = windows is not None or said.get("window") == "instant"
         runs = arrays["run"], tuple(arrays["turntable_deg"].tolist()), said["step_s"]

@@ -172,6 +172,8 @@ class Learned:
         Factor of N with which the parameters were learned; above 1 if the data do not fit.
     settled : bool
         Whether the parameters are learned; otherwise the prior is a fixed, wide one.
+    averaged : bool
+        Whether the prior is a mean over uncertain parameters; otherwise it has the most probable.
     still_moves : float
         How far the map still moves in the last round (rms, in its standard deviations) if prior
         and N are inferred together; 0 once they have converged.
@@ -188,6 +190,7 @@ class Learned:
     log_evidence: float
     noise_factor: float = field(default=1.0, kw_only=True)
     settled: bool = field(default=True, kw_only=True)
+    averaged: bool = field(default=True, kw_only=True)
     still_moves: float = field(default=0.0, kw_only=True)
     survey_rows: tuple[Row, ...] = field(default=(), kw_only=True)
     survey_gains: tuple[tuple[str, float], ...] = field(default=(), kw_only=True)
@@ -395,8 +398,7 @@ def _learned(
 
     try:
         with np.errstate(over="raise"), refusing(INFINITE, FloatingPointError):
-            two = (family.averaged(mean + level * first, about) for level in (0.0, np.log(2.0)))
-            once, twice = two
+            once, twice = (family.averaged(mean + by * first, about) for by in (0.0, np.log(2.0)))
         tried = [float(at_level(shift).log_evidence) for shift in (LIMITED if limited else LEVELS)]
         if limited:
             of_prior = [family.hyperprior.log_density(mean + by * first) for by in LIMITED]
@@ -412,7 +414,8 @@ def _learned(
         scores = Scores(family.hyperprior.scores(point.parameters), still, scores.log_gain)
     moved = shift * first / family.hyperprior.slopes_of_scores(scores.mean)[0]
     scores = replace(scores, mean=scores.mean + moved)
-    return Learned(prior, point.parameters, covariance, scores, evidence)
+    averaged = prior is not point.posterior.prior
+    return Learned(prior, point.parameters, covariance, scores, evidence, averaged=averaged)
 
 
 # at most SHARED skies have the same theta, and at most two do until there are LEAST theta

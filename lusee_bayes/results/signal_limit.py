@@ -137,8 +137,8 @@ def signal_limit(
         raise InputError(f"the {region} has temperatures that are not positive")
     linalg.checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
 
-    options = {"x_scale": "jac", "method": "trf", "full_output": True}
-    options |= dict.fromkeys(("ftol", "xtol", "gtol"), SETTLED)
+    options = {"x_scale": "jac", "method": "trf", "full_output": True, "absolute_sigma": True}
+    options |= dict.fromkeys(("ftol", "xtol", "gtol"), SETTLED) | {"sigma": spectrum.covariance[k]}
 
     def fitted(order: int) -> tuple[float, arrays.Vector, Float[np.ndarray, "frequency columns"]]:
         """Amplitude, white residuals, and derivatives by all parameters, for a degree."""
@@ -151,10 +151,9 @@ def signal_limit(
             return np.column_stack([np.exp(smooth @ values[:-1])[:, None] * smooth, t])
 
         start = np.append(np.linalg.lstsq(smooth, np.log(y), rcond=None)[0], 0.0)
-        given = modelled, f, y, start, spectrum.covariance[k]
         no_fit = f"the smooth spectrum of the {region} does not converge; lower --order"
         with refusing(no_fit, RuntimeError):
-            values, _, found, *_ = curve_fit(*given, absolute_sigma=True, jac=slopes, **options)
+            values, _, found, *_ = curve_fit(modelled, f, y, start, jac=slopes, **options)
         return float(values[-1]), found["fvec"], slopes(f, *values)
 
     amplitude, off, columns = fitted(order)
