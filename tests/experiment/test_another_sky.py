@@ -212,6 +212,8 @@ def test_a_prior_that_does_not_settle_with_n_is_said_to(monkeypatch):
     experiment = lb.build(scenario, data)
     assert experiment.learned.still_moves > 0.0
     assert "did not converge" in " ".join(doubts(experiment, lb.infer(experiment)))
+    uncertain = replace(experiment, learned=replace(experiment.learned, averaged=False))
+    assert "too uncertain to be averaged" in " ".join(doubts(uncertain, lb.infer(experiment)))
 
 
 def sky(lmax):
