@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, PRNGKeyArray
-from numpyro.infer import HMC, NUTS
+from numpyro.infer import HMC, MCMC, NUTS
 from numpyro.infer.hmc import HMCState
 from numpyro.infer.hmc_util import HMCAdaptState
 from numpyro.infer.mcmc import MCMCKernel
@@ -43,14 +43,14 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling import distributions, programs
 from lusee_bayes.systematics.systematic import SKY, Chart
 
-# statistics of every draw, by their ArviZ names
-STATISTICS: dict[str, Callable[[HMCState], Array]] = {
-    "lp": lambda s: -s.potential_energy,
-    "energy": lambda s: s.energy,
-    "diverging": lambda s: s.diverging,
-    "acceptance_rate": lambda s: s.accept_prob,
-    "step_size": lambda s: s.adapt_state.step_size,
-    "n_steps": lambda s: s.num_steps,
+# statistics of every draw by their ArviZ names, and NumPyro's names ("lp" is minus its potential)
+STATISTICS = {
+    "lp": "potential_energy",
+    "energy": "energy",
+    "diverging": "diverging",
+    "acceptance_rate": "accept_prob",
+    "step_size": "adapt_state.step_size",
+    "n_steps": "num_steps",
 }
 
 
@@ -570,7 +570,7 @@ def sample(
     """
     run = _Run(program, dict(arguments), sampler, whitening)
     chunks = [] if checkpoints is None else checkpoints.chunks()
-    done, total = 0, sampler.warmup + sampler.draws
+    done, total, white = 0, sampler.warmup + sampler.draws, programs.WHITE_SUFFIX
     with programs.numpyro_promotion():
         state = run.start()
         if not bool(jnp.isfinite(state.potential_energy).all()):
@@ -581,18 +581,18 @@ def sample(
         if chunks:
             done, state = chunks[-1].iteration, run.restore(state, chunks[-1].state)
         while done < total:
-            n = min(CHUNK, (sampler.warmup if done < sampler.warmup else total) - done)
-            state, rows = run.advance(state, n, run.dynamic)
-            done += n
-            leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
-            draws = {name: np.asarray(v)[:n] for name, v in rows.items() if done > sampler.warmup}
-            chunks.append(Chunk(done, leaves, draws))
+            state, rows = run.advance(state, run.dynamic)
+            done += CHUNK
+            keep = [name for name in rows if done > sampler.warmup and not name.endswith(white)]
+            draws = {name: np.swapaxes(jax.device_get(rows[name]), 0, 1) for name in keep}
+            chunks.append(Chunk(done, jax.device_get(jax.tree.leaves(state)), draws))
             if checkpoints is not None:
                 checkpoints.append(chunks[-1])
-            report(done, state)
+            report(min(done, total), state)
     parts = [chunk.draws for chunk in chunks if chunk.draws]
+    first = sampler.warmup % CHUNK  # the first chunk with draws may begin in warmup
     merged = {
-        name: np.concatenate([part[name] for part in parts]).swapaxes(0, 1)[:, : sampler.draws]
+        name: np.concatenate([p[name] for p in parts]).swapaxes(0, 1)[:, first:][:, : sampler.draws]
         for name in parts[0]
     }
     sites = {name: values for name, values in merged.items() if name not in STATISTICS}
@@ -625,7 +625,7 @@ class _Run:
         self.one_by_one = len(jax.local_devices()) == 1 and factorises
         self.advance = jax.jit(self._advance)
 
-    def _of_chains(self, function: Callable[[Any], HMCState], chains: Any) -> HMCState:
+    def _of_chains(self, function: Callable[[Any], Any], chains: Any) -> Any:
         """Apply a function of one chain to all of them."""
         return jax.lax.map(function, chains) if self.one_by_one else jax.vmap(function)(chains)
 
@@ -647,23 +647,20 @@ class _Run:
         ]
         return self._shared_out(jax.tree.unflatten(jax.tree.structure(like), arrays))
 
-    def _advance(self, state: HMCState, n, dynamic) -> tuple[HMCState, dict[str, Array]]:
-        """Run ``n`` iterations: return the state after them, and rows (CHUNK, chains, ...).
+    def _advance(self, state: HMCState, dynamic) -> tuple[HMCState, dict[str, Array]]:
+        """Run ``CHUNK`` iterations: return the state after them, and (chains, CHUNK, ...) rows."""
 
-        The first ``n`` rows are draws. ``n`` is traced: every chunk runs one compiled program.
-        """
+        warmup = self.sampler.warmup
 
-        def sample(state):
-            return self._of_chains(lambda s: self.kernel.sample(s, (dynamic,), {}), state)
+        def chain(state):
+            mcmc = MCMC(self.kernel, num_warmup=warmup, num_samples=CHUNK, progress_bar=False)
+            mcmc.post_warmup_state = state  # the kernel counts iterations: warmup is in pieces, too
+            mcmc.run(state.rng_key, dynamic, extra_fields=tuple(STATISTICS.values()))
+            fields = mcmc.get_extra_fields()
+            rows = {name: fields[field] for name, field in STATISTICS.items()}
+            return mcmc.last_state, mcmc.get_samples() | rows | {"lp": -rows["lp"]}
 
-        def step(state, i):
-            state = jax.lax.cond(i < n, sample, lambda state: state, state)
-            return state, {"z": state.z} | {name: of(state) for name, of in STATISTICS.items()}
-
-        state, rows = jax.lax.scan(step, state, jnp.arange(CHUNK))
-        sites = jax.vmap(jax.vmap(self.kernel.postprocess_fn((dynamic,), {})))(rows.pop("z"))
-        sites = {n: values for n, values in sites.items() if not n.endswith(programs.WHITE_SUFFIX)}
-        return state, sites | rows
+        return self._of_chains(chain, state)
 
     def _shared_out(self, state: HMCState) -> HMCState:
         devices = jax.local_devices()
