@@ -6,9 +6,11 @@ The spectrum y of a region, with the posterior covariance V of all frequencies
     y(f) = exp(sum_k c_k T_k(x)) + a t(f),    x = ln f scaled to -1 ... 1,
 
 a smooth sky, a polynomial of ln f, plus a template t of the amplitude a. T_k are Chebyshev
-polynomials; c and a have flat priors. Sky, gains, receivers and ground are in V. A sky that needs
-one more term can look like the template, which chi^2 does not show: given enough frequencies, the
-change of a with that term is part of its error.
+polynomials; c and a have flat priors. Sky, gains, receivers and ground are in V. The fit is linear
+about the smooth sky that fits best, which a signal that is detected changes: (|a| / error)^2 is
+then by how much the signal lowers chi^2, even if a smooth sky looks nearly the same. A sky that
+needs one more term can look like the template, too, which chi^2 does not show: given enough
+frequencies, the change of a with that term is part of its error.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebvander
+from scipy.linalg import solve_triangular
 from scipy.optimize import curve_fit
 from scipy.stats import foldnorm
 
@@ -30,10 +33,11 @@ from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.results.sky_spectrum import OBSERVED, Frequencies, SkySpectrum
 
-# degree of the polynomial, the relative tolerance of its fit, and the smallest template, in K
-ORDER, SETTLED, FAINT = 6, 1e-12, 1e-6
+# degree of the polynomial, how often it is fitted beside a signal, and the smallest template, in K
+ORDER, STEPS, FAINT = 6, 5, 1e-6
 # standard deviations of a detection, and the probability below the limit
 DETECTED, LEVEL = 5.0, 0.95
+Columns = Float[np.ndarray, "_ _"]
 TERM = "the next term of the polynomial"
 TABLE = Layout(
     "a template of a signal",
@@ -137,33 +141,40 @@ def signal_limit(
         raise InputError(f"the {region} has temperatures that are not positive")
     linalg.checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
 
-    options = {"x_scale": "jac", "method": "trf", "full_output": True, "absolute_sigma": True}
-    options |= dict.fromkeys(("ftol", "xtol", "gtol"), SETTLED) | {"sigma": spectrum.covariance[k]}
+    def triangle(columns: Columns, covariance: arrays.Square) -> Columns:
+        """The triangular factor of white columns: the last entry of each is beside all others."""
+        lower = np.linalg.cholesky(covariance)
+        return np.linalg.qr(solve_triangular(lower, columns, lower=True), mode="r")
 
-    def fitted(order: int) -> tuple[float, arrays.Vector, Float[np.ndarray, "frequency columns"]]:
-        """Amplitude, white residuals, and derivatives by all parameters, for a degree."""
-        smooth = chebvander(x, order)
+    def fitted(order: int) -> tuple[float, float, Columns]:
+        """Amplitude, chi^2, and derivatives by all parameters, for a degree."""
+        smooth, amplitude = chebvander(x, order), 0.0
 
-        def modelled(_: Frequencies, *values: float) -> Frequencies:
-            return np.exp(smooth @ values[:-1]) + values[-1] * t
+        def sky(_: Frequencies, *values: float) -> Frequencies:
+            return np.exp(smooth @ values)
 
-        def slopes(_: Frequencies, *values: float) -> Float[np.ndarray, "frequency columns"]:
-            return np.column_stack([np.exp(smooth @ values[:-1])[:, None] * smooth, t])
+        def slopes(_: Frequencies, *values: float) -> Columns:
+            return sky(_, *values)[:, None] * smooth
 
-        start = np.append(np.linalg.lstsq(smooth, np.log(y), rcond=None)[0], 0.0)
-        no_fit = f"the smooth spectrum of the {region} does not converge; lower --order"
-        with refusing(no_fit, RuntimeError):
-            values, _, found, *_ = curve_fit(modelled, f, y, start, jac=slopes, **options)
-        return float(values[-1]), found["fvec"], slopes(f, *values)
+        options = {"jac": slopes, "sigma": spectrum.covariance[k], "method": "trf"}
+        values = np.linalg.lstsq(smooth, np.log(y), rcond=None)[0]
+        for _ in range(STEPS):
+            left = y - amplitude * t
+            with refusing(f"no smooth spectrum fits the {region}; lower --order", RuntimeError):
+                values, *_ = curve_fit(sky, f, left, values, x_scale="jac", **options)
+            columns = np.column_stack([slopes(f, *values), t])
+            both = np.column_stack([columns, left - sky(f, *values)])
+            *_, (over, change), (_, rest) = triangle(both, spectrum.covariance[k])[:, -2:]
+            amplitude += float(change / over)
+            if abs(amplitude * over) < DETECTED:
+                break
+        return amplitude, float(rest**2), columns
 
-    amplitude, off, columns = fitted(order)
+    amplitude, chi2, columns = fitted(order)
     change = fitted(order + 1)[0] - amplitude if len(f) > order + 3 else 0.0
 
     def error_under(covariance: arrays.Square, change: float = change) -> float:
-        normal = columns.T @ np.linalg.solve(covariance, columns)
-        alike = f"{name}: a smooth spectrum of degree {order} looks the same; raise --order"
-        with refusing(alike, np.linalg.LinAlgError):
-            return float(np.hypot(np.sqrt(np.linalg.inv(normal)[-1, -1]), change))
+        return float(np.hypot(1.0 / triangle(columns, covariance)[-1, -1], change))
 
     std = error_under(spectrum.covariance[k])
     without = {TERM: error_under(spectrum.covariance[k], 0.0)}
@@ -174,7 +185,7 @@ def signal_limit(
         kept = np.sqrt(np.clip(1.0 - shares, 1e-6, 1.0))
         without[source] = error_under(spectrum.covariance[k] * np.outer(kept, kept))
     limit = float(foldnorm.ppf(LEVEL, abs(amplitude) / std, scale=std))
-    fit = ChiSquare(float(off @ off), float(len(f) - order - 2))
+    fit = ChiSquare(chi2, float(len(f) - order - 2))
     return SignalLimit(name, region, amplitude, std, limit, fit, without)
 
 

@@ -161,6 +161,19 @@ def test_a_sky_with_one_more_term_is_no_signal():
     assert sum(one.fit.fits for one in limits) >= 58
 
 
+@pytest.mark.parametrize("order", [3, 4, 5])
+def test_a_power_law_that_a_smooth_sky_contains_is_not_detected(order):
+    """The whole sky may be "excess": only chi^2 tells, which is that of noise."""
+    f = np.linspace(12.0, 45.0, 12)
+    sky, rng = sp.cane_1979(f) * np.exp(-((4.0 / f) ** 2.1)), np.random.default_rng(8)
+    covariance = np.outer(sky, sky) * (0.5 + 0.5 * np.eye(len(f))) * 9e-6
+    noise = rng.multivariate_normal(np.zeros(len(f)), covariance, size=40)
+    spectra = [spectrum_of(f, sky + one, covariance) for one in noise]
+    limits = [signal_limit(one, *named_template("excess"), order=order) for one in spectra]
+    assert not any(one.detected for one in limits) and all(one.limit > 0 for one in limits)
+    assert 0.3 < np.sqrt(np.mean([(one.amplitude / one.std) ** 2 for one in limits])) < 1.3
+
+
 def test_templates_and_what_has_no_limit(tmp_path):
     f = np.arange(5.0, 51.0)
     bent = spectrum_of(f, 1e5 * (1.0 + 0.5 * np.sin(f)), np.eye(len(f)))
