@@ -647,7 +647,8 @@ def _compared_surveys(setup: Setup, information: Information, learned: Learned) 
         family, known = under(one)
         start = known.parameters if known.settled else family.hyperprior.start()
         survey = one.at(setup.frequency_mhz, lmax_of(n))
-        errors = family.at(start).texture + family.white * np.eye(n)
+        # all by which the sky may depart from the survey, but its scale and its zero level
+        errors = family.at(start).covariance - family.wide[:, :2] @ family.wide[:, :2].T
         rows += survey.calibrated(others.mean, others.covariance(), errors)
         gained = fitting.posterior(known.prior).log_evidence - others.log_evidence
         gains.append((survey.name, float(gained)))

@@ -11,7 +11,7 @@ survey that contradicts the visibilities loses its weight.
 
 a and b follow from the map without surveys, N(mu, C), ::
 
-    s ~ N(B mu, B C B + E + scale_std^2 s s^T + zero_std^2 (4 pi y_0 y_0^T)),
+    s ~ N(B mu, B (C + E) B + scale_std^2 s s^T + zero_std^2 (4 pi y_0 y_0^T)),
 
 where E is the covariance of the learned deviations. Where the survey has no data, white noise
 brighter than any sky is added.
