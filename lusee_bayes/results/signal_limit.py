@@ -153,16 +153,12 @@ def signal_limit(
         def sky(_: Frequencies, *values: float) -> Frequencies:
             return np.exp(smooth @ values)
 
-        def slopes(_: Frequencies, *values: float) -> Columns:
-            return sky(_, *values)[:, None] * smooth
-
-        options = {"jac": slopes, "sigma": spectrum.covariance[k], "method": "trf"}
         values = np.linalg.lstsq(smooth, np.log(y), rcond=None)[0]
         for _ in range(STEPS):
             left = y - amplitude * t
             with refusing(f"no smooth spectrum fits the {region}; lower --order", RuntimeError):
-                values, *_ = curve_fit(sky, f, left, values, x_scale="jac", **options)
-            columns = np.column_stack([slopes(f, *values), t])
+                values, *_ = curve_fit(sky, f, left, values, spectrum.covariance[k], method="trf")
+            columns = np.column_stack([sky(f, *values)[:, None] * smooth, t])
             both = np.column_stack([columns, left - sky(f, *values)])
             *_, (over, change), (_, rest) = triangle(both, spectrum.covariance[k])[:, -2:]
             amplitude += float(change / over)

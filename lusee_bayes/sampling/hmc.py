@@ -579,7 +579,8 @@ def sample(
                 "roots of negative numbers, scales of zero, and data outside a support"
             )
         if chunks:
-            done, state = chunks[-1].iteration, run.restore(state, chunks[-1].state)
+            done, leaves = chunks[-1].iteration, chunks[-1].state
+            state = run.shared_out(jax.tree.unflatten(jax.tree.structure(state), leaves))
         while done < total:
             state, rows = run.advance(state, run.dynamic)
             done += CHUNK
@@ -637,15 +638,7 @@ class _Run:
             return self._of_chains(lambda key: self.kernel.init(key, *given), keys)
 
         keys = jax.random.split(jax.random.PRNGKey(self.sampler.seed), self.sampler.chains)
-        return self._shared_out(jax.jit(first)(keys, self.dynamic))
-
-    def restore(self, like: HMCState, leaves: list[np.ndarray]) -> HMCState:
-        """Restore a state from its leaves; ``like``: any state of this run."""
-        arrays = [
-            jnp.asarray(new, dtype=old.dtype)
-            for new, old in zip(leaves, jax.tree.leaves(like), strict=True)
-        ]
-        return self._shared_out(jax.tree.unflatten(jax.tree.structure(like), arrays))
+        return self.shared_out(jax.jit(first)(keys, self.dynamic))
 
     def _advance(self, state: HMCState, dynamic) -> tuple[HMCState, dict[str, Array]]:
         """Run ``CHUNK`` iterations: return the state after them, and (chains, CHUNK, ...) rows."""
@@ -662,7 +655,8 @@ class _Run:
 
         return self._of_chains(chain, state)
 
-    def _shared_out(self, state: HMCState) -> HMCState:
+    def shared_out(self, state: HMCState) -> HMCState:
+        """Share the chains equally among devices, if their number allows it."""
         devices = jax.local_devices()
         if len(devices) == 1 or self.sampler.chains % len(devices):
             return state
