@@ -169,9 +169,10 @@ class SpectralPrior(checks.Described, eqx.Module):
         # correct for the residuals' variance that the fit absorbs
         free = len(frequencies) / max(len(frequencies) - len(names), 1)
         left_over = np.sqrt(free) * (skies - mixing @ maps)
-        residuals = (left_over, 1.0) if residual is None else (skies, residual)
+        of, share = (left_over, 1.0) if residual is None else (skies, residual)
+        spectra = None if share == 0 else jnp.asarray(share**2 * power_spectrum(of))
         parts = map(jnp.asarray, (frequencies, mixing, power_spectrum(maps)))
-        return cls(*parts, _residual_spectra(*residuals), names)
+        return cls(*parts, spectra, names)
 
     def description(self) -> tuple[str, ...]:
         residual = "no residual" if self.residual is None else "a residual in each"
@@ -207,10 +208,3 @@ class SpectralPrior(checks.Described, eqx.Module):
         if self.residual is None:
             return None
         return namespace(self).sqrt(per_mode(self.residual[channel]))
-
-
-def _residual_spectra(skies: np.ndarray, residual: float) -> Float[Array, "channels ells"] | None:
-    """R^f_ell for a share of the skies; None for no residual."""
-    if residual < 0:
-        raise InputError(f"the residual must not be negative, got {residual}")
-    return None if residual == 0 else jnp.asarray(residual**2 * power_spectrum(skies))

@@ -105,19 +105,8 @@ class Receivers(Temperatures):
         if section.smooth_octaves is None:
             return super().truth(section, setup, key)
         x, n = np.log2(setup.frequency_mhz) / section.smooth_octaves, setup.beam_source.n_ports
-        z = _smooth_spectra(cls.own_key(key), n, float(x))
+        # sum_k (a_k cos w_k x + b_k sin w_k x) / sqrt(K), where a, b, w ~ N(0, 1): its covariance
+        # over keys, the mean of cos w (x - x'), is exp(-(x - x')^2 / 2)
+        waves, cosines, sines = np.asarray(jax.random.normal(cls.own_key(key), (3, n, N_WAVES)))
+        z = (cosines * np.cos(waves * x) + sines * np.sin(waves * x)).sum(1) / np.sqrt(N_WAVES)
         return cls.build(section, setup, Around()).values(z)
-
-
-def _smooth_spectra(key: PRNGKeyArray, n_ports: int, x: float) -> Float[np.ndarray, " ports"]:
-    """Values at x of functions with covariance exp(-(x - x')^2 / 2), one for each port.
-
-    ::
-
-        z(x) = sum_k (a_k cos w_k x + b_k sin w_k x) / sqrt(K),    a, b, w ~ N(0, 1),
-
-    whose covariance over keys is the mean of cos w (x - x'), and whose values are N(0, 1) for
-    any w.
-    """
-    waves, cosines, sines = np.asarray(jax.random.normal(key, (3, n_ports, N_WAVES)))
-    return (cosines * np.cos(waves * x) + sines * np.sin(waves * x)).sum(1) / np.sqrt(N_WAVES)

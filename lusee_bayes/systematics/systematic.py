@@ -558,7 +558,9 @@ class Expanded(Marginalised):
             *terms, doubt = around.volume
             slope = [(slopes(s) - still).T @ (later * w) for s, w in zip(*terms, strict=True)]
             del still
-            expected = -shrunk_mean(np.array(slope), doubt)
+            # less where the mean over terms does not exceed ``doubt`` standard errors by far
+            mean, error = np.mean(slope, 0), doubt * np.std(slope, 0, ddof=1) / np.sqrt(len(slope))
+            expected = -mean * np.clip(1.0 - (error / np.where(mean, mean, np.inf)) ** 2, 0.0, 1.0)
         columns = slopes(np.asarray(around.sky))
         shift = columns @ (expected - centre)
         columns = columns if gains is None else columns * gains[:, None]
@@ -569,12 +571,6 @@ class Expanded(Marginalised):
         noise = model.noise + covariances.LowRankCovariance(self.columns, self.systematic.words)
         at_centre = self.systematic.effect(model, self.systematic.values(self.centre))
         return with_added(replace(at_centre, noise=noise), self.shift)
-
-
-def shrunk_mean(terms: Float[np.ndarray, "terms n"], doubt: float) -> Vector:
-    """The mean over terms, less where it does not exceed ``doubt`` standard errors by far."""
-    mean, error = terms.mean(0), doubt * terms.std(0, ddof=1) / np.sqrt(len(terms))
-    return mean * np.clip(1.0 - (error / np.where(mean == 0.0, np.inf, mean)) ** 2, 0.0, 1.0)
 
 
 @eqx.filter_jit
