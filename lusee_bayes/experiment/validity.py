@@ -281,12 +281,12 @@ def reach(experiment: Experiment, inference: Inference, alone: bool = True) -> l
     k, moved_by = weighed(setup, np.asarray(experiment.data.data), inference) or (0.0, 0.0)
     if moved_by >= LARGEST_MOVE or (alone and k > LARGEST_K):
         keys = ", ".join(dict.fromkeys(part.systematic.key for part in inference.moving))
-        holds = "its errors are valid" if moved_by < LARGEST_MOVE else "its errors are not valid"
+        hold = "hold" if moved_by < LARGEST_MOVE else "do not hold"
         sentences.append(
-            f"The posterior of {keys} is not Gaussian: terms beyond first order move the map by "
-            f"{moved_by:.2g} of its standard deviations (rms; accepted: {LARGEST_MOVE:g}), and the "
-            f"weights of draws have Pareto k = {k:.2g} (accepted: {LARGEST_K:g}). Thus {holds}; "
-            "treatment=sampled needs no Gaussian."
+            f"The posterior of {keys} is not quite Gaussian. The map's errors {hold}: terms beyond "
+            f"first order move it by {moved_by:.2g} of its standard deviations (rms; accepted: "
+            f"{LARGEST_MOVE:g}), and the weights of draws have Pareto k = {k:.2g} (accepted: "
+            f"{LARGEST_K:g}). treatment=sampled needs no Gaussian."
         )
     if alone and setup.measured:
         spots = blind_spots(setup, inference, inference.posterior.mean)

@@ -126,10 +126,10 @@ def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them(monke
     # the map there is wrong by as much as it moves when N is built about what was found
     wrong = rms_of_directions(first, found.posterior.mean)
     assert k > validity.LARGEST_K and wrong / 3.0 < moved_by < 3.0 * wrong
-    assert "its errors are not valid" in validity.reach(experiment, first)[0]
+    assert "errors do not hold" in validity.reach(experiment, first)[0]
     # a few draws may miss where the Gaussian is wrong: even weights are not sufficient
     monkeypatch.setattr(validity, "weighed", lambda *_: (0.1, 2.0 * validity.LARGEST_MOVE))
-    assert "its errors are not valid" in validity.reach(experiment, found, alone=False)[0]
+    assert "errors do not hold" in validity.reach(experiment, found, alone=False)[0]
     # of several channels, those whose errors are valid say nothing
     monkeypatch.setattr(validity, "weighed", lambda *_: (np.inf, 0.1))
     assert validity.reach(experiment, found) and not validity.reach(experiment, found, alone=False)
