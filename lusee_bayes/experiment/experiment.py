@@ -163,10 +163,9 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     with stages("inconsistent times"):
         fit = fitting(experiment.setup, data, section.false_alarm, stages)
         setup, kept = without(experiment.setup, data, fit.flagged)
-    doubts = experiment.doubts
     if fit.remark:
         stages.say(f"  {fit.remark}")
-        doubts = (*doubts, fit.remark)
+    doubts = (*experiment.doubts, fit.remark) if fit.remark else experiment.doubts
     return replace(experiment, setup=setup, data=kept, doubts=doubts, fitting=fit)
 
 
@@ -292,12 +291,10 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
 def sampled_together(experiment: Experiment) -> dict[str, float]:
     """Octaves over which channels share each sampled site (:meth:`.Systematic.octaves`)."""
-    scenario, octaves_of = experiment.scenario, {}
-    for treatment, systematic in systematics(experiment.setup):
-        octaves = systematic.octaves(attrgetter(systematic.key)(scenario))
-        if treatment == "sampled" and octaves:
-            octaves_of |= {unknown.name: octaves for unknown in systematic.unknowns}
-    return octaves_of
+    sampled = [part for treatment, part in systematics(experiment.setup) if treatment == "sampled"]
+    scenario = experiment.scenario
+    each = [(part.unknowns, part.octaves(attrgetter(part.key)(scenario))) for part in sampled]
+    return {unknown.name: octaves for unknowns, octaves in each if octaves for unknown in unknowns}
 
 
 # number to fold into the seed for posterior draws

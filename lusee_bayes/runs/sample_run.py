@@ -41,7 +41,7 @@ from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.sampling import programs
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree
 from lusee_bayes.sampling.distributions import Marginal, TimesStudentT
-from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
+from lusee_bayes.sampling.hmc import CHUNK, Chains, Checkpoints, Sampler, Whitening, sample
 from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program
@@ -263,7 +263,8 @@ def _state_in_words(iteration: int, state: HMCState, sampler: Sampler) -> str:
 
 def _speed(times: list[tuple[float, int]], chains: Chains, warmup: int) -> float | None:
     """Steps per second between the first and the last file of draws of this session."""
-    drawn = [(at, done - warmup) for at, done in times if done > warmup]
+    # only whole pieces: more is drawn in the last than is asked for
+    drawn = [(at, n - warmup) for at, n in times if n > warmup and not n % CHUNK]
     if len(drawn) < 2:
         return None
     (start, first), (end, last) = drawn[0], drawn[-1]

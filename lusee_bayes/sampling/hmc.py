@@ -590,14 +590,15 @@ def sample(
             if checkpoints is not None:
                 checkpoints.append(chunks[-1])
             report(min(done, total), state)
-    parts = [chunk.draws for chunk in chunks if chunk.draws]
-    first = sampler.warmup % CHUNK  # the first chunk with draws may begin in warmup
+    drawn = [chunk for chunk in chunks if chunk.draws]
+    # the first chunk with draws may begin in warmup
+    first = max(0, sampler.warmup - drawn[0].iteration + len(drawn[0].draws["lp"]))
+    kept = slice(first, first + sampler.draws)
     merged = {
-        name: np.concatenate([p[name] for p in parts]).swapaxes(0, 1)[:, first:][:, : sampler.draws]
-        for name in parts[0]
+        name: np.concatenate([one.draws[name] for one in drawn]).swapaxes(0, 1)[:, kept]
+        for name in drawn[0].draws
     }
-    sites = {name: values for name, values in merged.items() if name not in STATISTICS}
-    return Chains(sites, {name: merged[name] for name in STATISTICS})
+    return Chains(statistics={name: merged.pop(name) for name in STATISTICS}, sites=merged)
 
 
 class _Run:
@@ -643,10 +644,10 @@ class _Run:
     def _advance(self, state: HMCState, dynamic) -> tuple[HMCState, dict[str, Array]]:
         """Run ``CHUNK`` iterations: return the state after them, and (chains, CHUNK, ...) rows."""
 
-        warmup = self.sampler.warmup
+        lengths = {"num_warmup": self.sampler.warmup, "num_samples": CHUNK}
 
         def chain(state):
-            mcmc = MCMC(self.kernel, num_warmup=warmup, num_samples=CHUNK, progress_bar=False)
+            mcmc = MCMC(self.kernel, progress_bar=False, **lengths)
             mcmc.post_warmup_state = state  # the kernel counts iterations: warmup is in pieces, too
             mcmc.run(state.rng_key, dynamic, extra_fields=tuple(STATISTICS.values()))
             fields = mcmc.get_extra_fields()

@@ -268,8 +268,11 @@ def collapsed_draws(
     return np.asarray(Predictive(model, given, batch_ndims=2, return_sites=[drawn])(key)[drawn])
 
 
-# names that samples.nc reserves
-TAKEN = ("chain", "draw", "mode", "datum", "ell", "m", "product", "time")
+# names that samples.nc reserves: of dimensions, constants and statistics
+TAKEN = re.compile(
+    "chain|draw|mode|datum|ell|m|product|time|truth|analytic_mean|analytic_std|prior_std|lp|energy|"
+    "diverging|acceptance_rate|step_size|n_steps"
+)
 # names that netCDF, summaries and tables accept without quotes
 NAME = re.compile(r"[^\W\d][\w.\-]*")
 
@@ -358,15 +361,15 @@ def _require_site(name: str, site: dict[str, Any], latent: bool, who: str) -> No
     if not NAME.fullmatch(name):
         wrong = f"{who} has a site '{name}'; use letters, digits, '_', '.' and '-', a letter first"
         raise InputError(wrong)
-    if name in TAKEN or name.endswith(WHITE_SUFFIX):
+    if TAKEN.fullmatch(name) or name.endswith(WHITE_SUFFIX):
         raise InputError(f"{who} has a site '{name}', a reserved name; rename it")
     if latent and site["fn"].support.is_discrete:
         raise InputError(
             f"{who} has the discrete site '{name}'; Hamiltonian Monte Carlo needs continuous ones: "
             "sum over it, or use a continuous distribution"
         )
-    if latent and jnp.issubdtype(jnp.result_type(site["value"]), jnp.complexfloating):
-        raise InputError(f"{who} has the complex site '{name}'; sample real and imaginary part")
+    if [*map(jnp.iscomplexobj, jax.tree.leaves(site["value"]))] != [False]:
+        raise InputError(f"{who} has the complex site '{name}'; use one for each real part")
 
 
 def _require_shape(site: dict[str, Any], shape: tuple[int, ...], what: str) -> None:

@@ -38,7 +38,8 @@ class PointingSection(Section):
     Attributes
     ----------
     clock_s : float
-        Delay of the samples relative to their recorded times.
+        Delay of the samples relative to their recorded times, during which the Moon is taken to
+        turn uniformly.
     clock_drift_s_per_day : float
         Increase of this delay per day since the first sample.
     turntable_deg : float
@@ -59,7 +60,7 @@ class PointingSection(Section):
         the others are drawn from their priors.
     """
 
-    clock_s: Annotated[float, Field(gt=0, le=1e6), NOT_TINY] | None = None
+    clock_s: Annotated[float, Field(gt=0, le=1000.0), NOT_TINY] | None = None
     clock_drift_s_per_day: Annotated[float, Field(gt=0, le=1e4), NOT_TINY] | None = None
     turntable_deg: Offset | None = None
     lon_deg: Offset | None = None

@@ -76,7 +76,6 @@ def test_scale_and_zero_level_are_found_and_the_map_gains(tmp_path, data, alone,
     for name, value in (("scale", SCALE), ("zero level (K at the map's frequency)", ZERO * mean)):
         row = rows[f"{name} of survey.fits at 25 MHz"]
         assert abs(row["value"] - value) < 3.5 * row["std"]
-    assert rows["scale of survey.fits at 25 MHz"]["std"] < 0.1
     stds = [np.sqrt(np.trace(each.solution.covariance)) for each in (found, alone[1])]
     assert stds[0] < 0.5 * stds[1]
     assert 0.4 < distance < 1.6

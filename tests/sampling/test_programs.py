@@ -274,6 +274,8 @@ BAD = {
     "discrete": ('    numpyro.sample("k", dist.Poisson(3))\n' + GOOD, "discrete site 'k'"),
     "slash": ('    numpyro.sample("a/b", dist.Normal(0, 1))\n' + GOOD, "a site 'a/b'"),
     "empty": ('    numpyro.sample("", dist.Normal(0, 1))\n' + GOOD, "a site ''"),
+    "statistic": ('    numpyro.deterministic("energy", loc)\n' + GOOD, "'energy', a reserved"),
+    "complex one": ('    numpyro.deterministic("z", 1j * loc)\n' + GOOD, "complex site 'z'"),
     "dimension": ('    numpyro.sample("chain", dist.Normal(0, 1))\n' + GOOD, "'chain', a reserved"),
     "derived": ('    numpyro.deterministic("x/y", loc)\n' + GOOD, "a site 'x/y'"),
     "shape": (
