@@ -291,9 +291,8 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
 def sampled_together(experiment: Experiment) -> dict[str, float]:
     """Octaves over which channels share each sampled site (:meth:`.Systematic.octaves`)."""
-    sampled = [part for treatment, part in systematics(experiment.setup) if treatment == "sampled"]
-    scenario = experiment.scenario
-    each = [(part.unknowns, part.octaves(attrgetter(part.key)(scenario))) for part in sampled]
+    parts = [part for treatment, part in systematics(experiment.setup) if treatment == "sampled"]
+    each = [(x.unknowns, x.octaves(attrgetter(x.key)(experiment.scenario))) for x in parts]
     return {unknown.name: octaves for unknowns, octaves in each if octaves for unknown in unknowns}
 
 
@@ -399,9 +398,8 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
     missing = np.diff(turned, append=turned[0] + 1.0).max()
     if learned is not None and not learned.survey_gains and missing > MOST_MISSING:
         notes.append(
-            f"{missing:.0%} of a lunar rotation has no data: the prior is learned from a part of "
-            "the sky, and the rest may be more structured. In tests with a third of a rotation, "
-            "errors were 2 times too small at lmax 14, at most 1.4 times at lmax 47: raise lmax."
+            f"{missing:.0%} of a lunar rotation has no data. A prior learned from a third made "
+            "errors 2 times too small at lmax 14, and at most 1.4 times at lmax 47: raise lmax."
         )
     if learned is not None and learned.still_moves > 0.0:
         notes.append(

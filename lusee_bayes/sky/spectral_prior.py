@@ -72,9 +72,11 @@ def check_components(names: tuple[str, ...], n_channels: int, residual: float | 
     Raises
     ------
     InputError
-        For unknown names, and for fewer channels than the components need.
+        For unknown names, a negative residual, and fewer channels than the components need.
     """
     require_names("component", "spectral components", names, SPECTRA, n_channels)
+    if residual is not None and residual < 0.0:
+        raise InputError(f"the residual must not be negative, got {residual}")
     if residual is None and n_channels == len(names):
         raise InputError(
             f"{len(names)} spectral components fit any skies of {n_channels} channels exactly; "
