@@ -7,10 +7,10 @@ The spectrum y of a region, with the posterior covariance V of all frequencies
 
 a smooth sky, a polynomial of ln f, plus a template t of the amplitude a. T_k are Chebyshev
 polynomials; c and a have flat priors. Sky, gains, receivers and ground are in V. The fit is linear
-about the smooth sky that fits best, which a signal that is detected changes: (|a| / error)^2 is
-then by how much the signal lowers chi^2, even if a smooth sky looks nearly the same. A sky that
-needs one more term can look like the template, too, which chi^2 does not show: given enough
-frequencies, the change of a with that term is part of its error.
+about the smooth sky that fits best, which a signal that is detected changes: the square of a over
+its error is then by how much the signal lowers chi^2, even if a smooth sky looks nearly the same. A
+sky that needs one more term can look like the template, too, which chi^2 does not show: given
+enough frequencies, the change of a with that term is part of its error.
 """
 
 from __future__ import annotations
