@@ -399,7 +399,7 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
     if learned is not None and not learned.survey_gains and missing > MOST_MISSING:
         notes.append(
             f"{missing:.0%} of a lunar rotation has no data. In tests with 67%, error bars under a "
-            "learned prior were 2 times too small at lmax 14, and at most 1.4 at lmax 47: raise lmax."
+            "learned prior were 2 times too small at lmax 14, at most 1.4 at lmax 47: raise lmax."
         )
     if learned is not None and learned.still_moves > 0.0:
         notes.append(
