@@ -68,6 +68,7 @@ MOST_NAMED = 4
 # sizes of errors, by name, their unit, the power of them that acts, and what is added to the data
 Columns = Float[np.ndarray, "data columns"]
 Errors = tuple[dict[str, float], str, int, Columns]
+Reach = tuple[list[str], list[str]]
 
 
 def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float, float] | None:
@@ -266,8 +267,8 @@ def about_sky_above(setup: Setup) -> list[str]:
     ]
 
 
-def reach(experiment: Experiment, inference: Inference, alone: bool = True) -> list[str]:
-    """Doubts about the Gaussian, and errors that data would not reveal, one sentence each.
+def reach(experiment: Experiment, inference: Inference, alone: bool = True) -> Reach:
+    """Doubts about the Gaussian; and notes, on errors that data would not reveal. A sentence each.
 
     Parameters
     ----------
@@ -275,14 +276,15 @@ def reach(experiment: Experiment, inference: Inference, alone: bool = True) -> l
     inference : Inference
         Inference from its data.
     alone : bool
-        Whether it is the only channel; of several, only doubts about the errors are listed.
+        Whether it is the only channel; of several, only doubts are listed.
     """
-    sentences, setup = [], experiment.setup
+    doubts, notes, setup = [], [], experiment.setup
     k, moved_by = weighed(setup, np.asarray(experiment.data.data), inference) or (0.0, 0.0)
-    if moved_by >= LARGEST_MOVE or (alone and k > LARGEST_K):
+    wrong = moved_by >= LARGEST_MOVE
+    if wrong or (alone and k > LARGEST_K):
         keys = ", ".join(dict.fromkeys(part.systematic.key for part in inference.moving))
-        hold = "hold" if moved_by < LARGEST_MOVE else "do not hold"
-        sentences.append(
+        hold = "do not hold" if wrong else "hold"
+        (doubts if wrong else notes).append(
             f"The posterior of {keys} is not quite Gaussian. The map's errors {hold}: terms beyond "
             f"first order move it by {moved_by:.2g} of its standard deviations (rms; accepted: "
             f"{LARGEST_MOVE:g}), and the weights of draws have Pareto k = {k:.2g} (accepted: "
@@ -290,5 +292,5 @@ def reach(experiment: Experiment, inference: Inference, alone: bool = True) -> l
         )
     if alone and setup.measured:
         spots = blind_spots(setup, inference, inference.posterior.mean)
-        sentences += filter(None, [blind_sentence(spots)])
-    return sentences
+        notes += filter(None, [blind_sentence(spots)])
+    return doubts, notes

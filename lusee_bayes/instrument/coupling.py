@@ -83,25 +83,25 @@ class Coupling(Described, eqx.Module):
         """A as a matrix, without the response (as in all methods below)."""
 
     @abstractmethod
-    def _forward(self, sky: Modes) -> DataVector:
-        """A m, for a vector of checked type and shape."""
+    def _forward(self, sky: Float[Array, "unknowns *n"]) -> Float[Array, "data *n"]:
+        """A m, for vectors of checked type and shape."""
 
     @abstractmethod
     def _backward(self, data: Float[Array, "data *n"]) -> Float[Array, "unknowns *n"]:
         """A^T d, for vectors of checked type and shape."""
 
-    def __matmul__(self, sky: Modes) -> DataVector:
+    def __matmul__(self, sky: Float[Array, "unknowns *n"]) -> Float[Array, "data *n"]:
         """Compute A m: the mean data of a sky.
 
         Parameters
         ----------
-        sky : (unknowns,) array
-            In K; for harmonics the Galactic coefficients. Its values are not checked: NaN gives
-            NaN.
+        sky : (unknowns,) or (unknowns, n) array
+            In K; for harmonics the Galactic coefficients; or several skies as columns. Values are
+            not checked: NaN gives NaN.
 
         Returns
         -------
-        (data,) array
+        (data,) or (data, n) array
             Visibilities in K.
 
         Raises
@@ -110,9 +110,9 @@ class Coupling(Described, eqx.Module):
             If ``sky`` is not float64 or has another length.
         """
         require_float64("the sky", sky)
-        require_shape("the sky", sky, (self.shape[1],))
+        require_shape("the sky", sky, (self.shape[1], *sky.shape[1:2]))
         data = self._forward(sky)
-        return data if self.response is None else data * self.response
+        return data if self.response is None else (data.T * self.response).T
 
     def transpose_mv(self, data: Float[Array, "data *n"]) -> Float[Array, "unknowns *n"]:
         """Compute A^T d.
@@ -465,20 +465,21 @@ class CouplingMatrix(Coupling):
         return self.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
 
     @compiled
-    def _forward(self, sky: Modes) -> DataVector:
+    def _forward(self, sky: Float[Array, "modes *n"]) -> Float[Array, "data *n"]:
+        n, columns = self.lmax + 1, sky.shape[1:]
         n_products, n_functions = self.body_beams.shape[1:3]
-        pairs = _pairs(self.pointing.pole_from_galactic(sky), self.lmax)
-        plus, minus = pairs[: self.lmax + 1], pairs[self.lmax + 1 :]
-        xp, zero_order = namespace(self, sky), np.arange(self.lmax + 1)[None] == 0
-        crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
-        both, grids = xp.stack([pairs.T, crossed.T], axis=-1), []
-        for run, part in self._parts():
+        pairs = _pairs(self.pointing.pole_from_galactic(sky.reshape(len(sky), -1).T), self.lmax)
+        xp, zero_order, half = namespace(self, sky), np.arange(n) == 0, len(pairs)
+        crossed = [pairs[:, n:], -xp.where(zero_order, 0.0, pairs[:, :n])]
+        both, grids = xp.concatenate([pairs, xp.concatenate(crossed, axis=1)]).T, []
+        for run, part in self._parts(half):
             x_and_y = self.by_order[run] @ both
             cosine, sine = _phases(self.pointing.azimuth[part], self.lmax)
-            over_time = cosine @ x_and_y[..., 0] + sine @ x_and_y[..., 1]
-            over_time = over_time.reshape(-1, n_products, n_functions)
-            grids.append((over_time * self.pointing.functions[part][:, None]).sum(-1).T)
-        return self.layout.gather(xp.concatenate(grids, axis=1))
+            x, y = (one.reshape(n, -1) for one in (x_and_y[..., :half], x_and_y[..., half:]))
+            over_time = (cosine @ x + sine @ y).reshape(-1, n_products, n_functions, half)
+            seen = (over_time * self.pointing.functions[part][:, None, :, None]).sum(2)
+            grids.append(seen.swapaxes(0, 1))
+        return self.layout.gather(xp.concatenate(grids, axis=1)).reshape(-1, *columns)
 
     @compiled
     def _backward(self, data: Float[Array, "data *n"]) -> Float[Array, "modes *n"]:

@@ -45,9 +45,10 @@ class ChannelCouplings(Coupling):
         n_modes = self.matrices[0].shape[1]
         return sum(map(len, self.matrices)), self.mixing.shape[1] * n_modes
 
-    def skies(self, maps: Float[Array, " unknowns"]) -> Float[Array, "channels modes"]:
+    def skies(self, maps: Float[Array, "unknowns *n"]) -> Float[Array, "channels modes *n"]:
         """Skies of all channels, given all maps in one vector."""
-        return self.mixing @ maps.reshape(self.mixing.shape[1], -1)
+        by_map = maps.reshape(self.mixing.shape[1], -1, *maps.shape[1:])
+        return jnp.tensordot(self.mixing, by_map, 1)
 
     def _matrix(self):
         return jnp.concatenate([*map(jnp.kron, self.mixing[:, None], self.matrices)])

@@ -149,6 +149,7 @@ def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any
         folder,
         run=run,
         doubts=run.get("doubts", ()),
+        notes=run.get("notes", ()),
         provenance=Provenance.read(folder),
         scenario=scenario,
         scenario_hash=text_hash(scenario)[:12],

@@ -138,6 +138,8 @@ class ChannelData:
         Rms difference between true and modelled beams, where they differ.
     doubts : tuple of str
         Doubts about the data, a sentence each.
+    notes : tuple of str
+        Limits of the model that are no doubts, a sentence each.
     judged : Judged or None
         Tests group by group; None for one of several channels if it fits.
     details : Details or None
@@ -176,6 +178,7 @@ class ChannelData:
     log_evidence_learned: float | None = None
     beam_rms_difference: float | None = None
     doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     judged: Judged | None = None
     details: Details | None = None
     pointing: reports.PointingReport | None = None

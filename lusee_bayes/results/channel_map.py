@@ -278,11 +278,9 @@ class Conditioned:
         if scenario.noise.pointing is not None or bad:
             with stages("clock and pointing"):
                 found["pointing"] = pointing_report(experiment, inference)
-        doubtful = list(doubts(experiment, inference))
-        if left is not None:
-            doubtful += about_sky_above(experiment.setup)
+        notes = [] if left is None else about_sky_above(experiment.setup)
         with stages("first order"):
-            doubtful += reach(experiment, inference, alone)
+            not_gaussian, harmless = reach(experiment, inference, alone)
         fitting = experiment.fitting
         altitude = measures.highest_altitude(data.observation, scenario.map_nside)
         if not joint:
@@ -307,7 +305,8 @@ class Conditioned:
             parameters=() if learned is None else tuple(learned.as_rows()),
             log_evidence_learned=None if learned is None else learned.log_evidence,
             beam_rms_difference=beam_rms_difference(experiment.setup),
-            doubts=tuple(doubtful),
+            doubts=(*doubts(experiment, inference), *not_gaussian),
+            notes=(*notes, *harmless),
             digests=self.digests,
             information=self.information if scenario.output.information else None,
             **found,

@@ -261,7 +261,7 @@ class MapResult(Described):
         """
         found = any(c.diagnosis is not None and c.diagnosis.proposals for c in self.channels)
         details = self._details() if verbose or found or self.fit.level != "consistent" else []
-        remarks = *self.doubts(), *self.gaps(), *self._flags()
+        remarks = *self.remarks("doubts"), *self.remarks("notes"), *self.gaps(), *self._flags()
         return [*details, *remarks, self.fit.headline, self.headline()]
 
     def _details(self) -> list[str]:
@@ -287,11 +287,11 @@ class MapResult(Described):
         line = reduced.flag_line(band, self.channel.flagged_share)
         return [line.capitalize(), *reduced.doubts(band), *reduced.notes()]
 
-    def doubts(self) -> list[str]:
-        """Doubts about the data, with the frequency if there are several channels."""
+    def remarks(self, kind: str) -> list[str]:
+        """``doubts`` or ``notes``, with the frequency if there are several channels."""
         if self.single:
-            return list(self.channel.doubts)
-        return [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
+            return list(getattr(self.channel, kind))
+        return [f"{c.frequency_mhz:g} MHz: {x}" for c in self.channels for x in getattr(c, kind)]
 
     def gaps(self) -> list[str]:
         """The channels that could not be mapped, and why, a sentence each."""
@@ -339,7 +339,8 @@ class MapResult(Described):
             log_evidence=self.log_evidence,
             n_data=sum(channel.n_data for channel in self.channels),
             n_modes=len(self.channel.mean),
-            doubts=self.doubts(),
+            doubts=self.remarks("doubts"),
+            notes=self.remarks("notes"),
             tests=[] if self.single else self.fits().tests(),
             shared=self.shared_tests,
             pulls=[] if self.single else self.pulls(),

@@ -95,6 +95,7 @@ class MapSummary(BaseModel):
     n_data: int
     n_modes: int
     doubts: list[str]
+    notes: list[str] = []
     tests: list[JointTest]
     shared: list[SharedTest] = []
     pulls: list[PullSummary]

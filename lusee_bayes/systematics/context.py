@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes
-from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.source import BeamSource, Receiver
@@ -69,10 +68,7 @@ class Above:
     @cached_property
     def seen(self) -> tuple[Float[Array, "data rank"], DataVector]:
         """Root and mean of the contribution to the data, in K."""
-        if self.coupling.shape[0] < self.coupling.shape[1]:
-            return np.asarray(self.coupling.dense()) @ self.root, self.coupling @ self.mean
-        root = in_threads(self.coupling.__matmul__, list(np.ascontiguousarray(self.root.T)))
-        return np.reshape(root, (-1, self.coupling.shape[0])).T, self.coupling @ self.mean
+        return self.coupling @ self.root, self.coupling @ self.mean
 
 
 @dataclass(frozen=True)

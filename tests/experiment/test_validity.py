@@ -118,7 +118,7 @@ def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them(monke
     found, setup, d = lb.infer(experiment), experiment.setup, np.asarray(experiment.data.data)
     k, moved_by = validity.weighed(setup, d, found)
     assert k < validity.LARGEST_K and moved_by < 0.1 * validity.LARGEST_MOVE
-    assert not validity.reach(experiment, found)
+    assert validity.reach(experiment, found) == ([], [])
     # about the prior's means, two standard deviations off, the first order is far from the model
     model, held = model_about(setup, Around(experiment.data))
     first = Inference(model.condition(d), held, 1, Around(experiment.data))
@@ -126,18 +126,20 @@ def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them(monke
     # the map there is wrong by as much as it moves when N is built about what was found
     wrong = rms_of_directions(first, found.posterior.mean)
     assert k > validity.LARGEST_K and wrong / 3.0 < moved_by < 3.0 * wrong
-    assert "errors do not hold" in validity.reach(experiment, first)[0]
+    assert "errors do not hold" in validity.reach(experiment, first)[0][0]
     # a few draws may miss where the Gaussian is wrong: even weights are not sufficient
     monkeypatch.setattr(validity, "weighed", lambda *_: (0.1, 2.0 * validity.LARGEST_MOVE))
-    assert "errors do not hold" in validity.reach(experiment, found, alone=False)[0]
-    # of several channels, those whose errors are valid say nothing
+    assert "errors do not hold" in validity.reach(experiment, found, alone=False)[0][0]
+    # errors that hold are no doubt, and of several channels such ones say nothing
     monkeypatch.setattr(validity, "weighed", lambda *_: (np.inf, 0.1))
-    assert validity.reach(experiment, found) and not validity.reach(experiment, found, alone=False)
+    doubts, (note,) = validity.reach(experiment, found)
+    assert not doubts and "errors hold" in note
+    assert validity.reach(experiment, found, alone=False) == ([], [])
 
 
 def test_nothing_is_weighed_where_nothing_was_found_in_rounds(plain):
     experiment, found = plain
     assert validity.weighed(experiment.setup, np.asarray(experiment.data.data), found) is None
     measured = replace(experiment, setup=replace(experiment.setup, measured=True))
-    assert "would not reveal" in validity.reach(measured, found)[0]
+    assert "would not reveal" in validity.reach(measured, found)[1][0]
     assert base_model(experiment.setup).n_data == found.model.n_data

@@ -327,7 +327,7 @@ def test_a_wrong_resonance_in_one_channel_of_eight_is_named(tmp_path, monkeypatc
 
     monkeypatch.setattr(channels, "measured_experiment", measured)
     found = map_channels(eight, tmp_path)
-    assert found.fit.level == "does not fit" and not found.doubts()
+    assert found.fit.level == "does not fit" and not found.remarks("doubts")
     assert found.lines()[0].startswith("19 MHz (p ") and "do not fit" in found.lines()[-2]
     assert [one.disagrees for one in found.summary().shared] == [f == 19.0 for f in frequencies]
     # what is drawn is shared
