@@ -17,7 +17,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
-from lusee_bayes.experiment.model import model_about, moved, with_sky_above
+from lusee_bayes.experiment.model import base_model, model_about, moved, with_sky_above
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes, variance_factor
 from lusee_bayes.linear.information import Information, integrated_out
@@ -26,7 +26,7 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import LowRankFactor, LowRankUpdate
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, averaged_beyond, learn_whatever_fits
-from lusee_bayes.sky.prior import Prior
+from lusee_bayes.sky.prior import IndependentPrior, Prior
 from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.context import Around, Setup, Volume
 from lusee_bayes.systematics.gain_drifts import GainDrifts, gains_about
@@ -198,14 +198,20 @@ class Inference:
         skies = [mean, *([self.around.sky] if self.moving else [])]
         return max(float(self.posterior.rms_shift_from(sky)) for sky in skies)
 
-    def under(self, prior: Prior, learned: Learned | None = None) -> Inference:
-        """The inference under another prior, with how it was learned."""
-        solution = self.solution.under(prior)
+    def under(
+        self, prior: Prior, learned: Learned | None = None, model: LinearGaussian | None = None
+    ) -> Inference:
+        """The inference under another prior, with how it was learned; or for another sky."""
+        solution = self.solution
+        if model is None:
+            solution = solution.under(prior)
+        else:
+            solution = replace(model, prior=prior).condition(solution.data)
         return replace(self, solution=_less_moved(solution, self.systematics), learned=learned)
 
 
-# learns a prior from the information in data, starting at given parameters
-Learning = Callable[[Information, Vector | None], Learned]
+# learns a prior from an inference, starting at given parameters
+Learning = Callable[[Inference, Vector | None], Learned]
 # receives the number of rounds done, and a remark
 Report = Callable[[int, str], None]
 
@@ -238,7 +244,7 @@ def settled(
         no sky is given, the sky is solved for the given or else the expected values. If ``still``,
         the first round is the last.
     learn : callable, optional
-        ``learn(information, start)`` learns the prior during the rounds: first when they have
+        ``learn(inference, start)`` learns the prior during the rounds: first when they have
         nearly converged, last when it moves the map by less than 0.05 standard deviations.
     report : callable, optional
         ``report(rounds, remark)`` is called after every round.
@@ -274,7 +280,7 @@ def settled(
         at_rest = moves < SETTLED
         if learn is not None and n_learned < MAX_LEARNED and (at_rest or last or learned is None):
             before = None if learned is None or not learned.settled else learned.parameters
-            learned, n_learned = learn(inference.solution.information, before), n_learned + 1
+            learned, n_learned = learn(inference, before), n_learned + 1
             relearned = inference.under(learned.prior, learned)
             changed, inference = relearned.moves_from(inference.posterior.mean), relearned
             if in_rounds and changed > PRIOR_SETTLED:
@@ -564,7 +570,7 @@ def with_learned_prior(
     start : Around
         As in :func:`settled`, with the data.
     earlier : Information or None
-        Information in earlier data, from which the prior is also learned.
+        Information in earlier data, from which the prior is also learned (:func:`of_whole_sky`).
     report : callable or None
         As in :func:`settled`.
 
@@ -578,18 +584,20 @@ def with_learned_prior(
 
     first, surveys = None, setup.scenario.prior.surveys
 
-    def whole(information: Information) -> Information:
-        return information if earlier is None else information + earlier
+    def whole(inference: Inference) -> Information:
+        if earlier is None:
+            return inference.solution.information
+        return of_map(setup, of_whole_sky(setup, inference) + earlier)
 
-    def learn(information: Information, at: Vector | None) -> Learned:
-        return learned_prior(setup, whole(information), first if at is None else at)
+    def learn(inference: Inference, at: Vector | None) -> Learned:
+        return learned_prior(setup, whole(inference), first if at is None else at)
 
     if AboveLmax.treatment(setup.scenario) in ("marginalised", "sampled"):
         # the expected sky above lmax follows from the prior learned below
         result = settled(setup, start, report=report)
         # a survey's resolution ends somewhere: what is above it is as strong as without surveys
         plain = _with_surveys(setup, ()) if surveys else setup
-        coarse, learned = first_learned(plain, whole(result.solution.information))
+        coarse, learned = first_learned(plain, whole(result))
         start = result.around
         # data that do not fit say nothing about the sky above lmax
         if learned.settled and learned.noise_factor < MOST_RAISED and not start.still:
@@ -604,7 +612,7 @@ def with_learned_prior(
             setup = _with_learned_sky_above(setup, covariance, start)
     result = settled(setup, start, learn, report)
     if surveys:
-        learned = _compared_surveys(setup, whole(result.solution.information), result.learned)
+        learned = _compared_surveys(setup, whole(result), result.learned)
         result = replace(result, learned=learned)
     return replace(setup, prior=result.learned.prior), result
 
@@ -625,10 +633,57 @@ def _with_learned_sky_above(setup: Setup, covariance: ModesMatrix, around: Aroun
     found = under(new)
     (term,) = (s.systematic for s in found.systematics if isinstance(s.systematic, AboveLmax))
     level = variance_factor(template_amplitudes(found.solution, term.root), LOG_LEVEL_STD)
-    root, power = new.above.root * np.sqrt(level), new.above.power * level
-    new = replace(new, above=replace(new.above, root=root, power=power))
+    above, root = new.above, new.above.root * np.sqrt(level)
+    more = {"covariance": above.covariance * level, "power": above.power * level}
+    new = replace(new, above=replace(above, root=root, **more))
     before, after = (float(under(one).posterior.log_evidence) for one in (setup, new))
     return new if after > before - LEAST_WORSE else setup
+
+
+def model_of_whole_sky(setup: Setup, inference: Inference) -> LinearGaussian | None:
+    """The model with the sky above lmax among its unknowns; None if it is not in N.
+
+    They are skies minus :func:`expected_sky`, independent a priori.
+    """
+    parts = inference.systematics
+    held = [part for part in parts if not isinstance(part.systematic, AboveLmax)]
+    if len(held) == len(parts):
+        return None
+    above = moved(setup, inference.around.values, above=True).above
+    model = base_model(setup, inference.around)
+    for part in held:
+        model = part.marginalised(model)
+    std = np.sqrt(np.append(setup.prior.variance(), np.diagonal(above.covariance)))
+    coupling = replace(above.coupling, response=inference.model.coupling.response)
+    offset = coupling @ expected_sky(setup) + (0.0 if model.offset is None else model.offset)
+    return LinearGaussian(coupling, IndependentPrior(std), model.noise, offset)
+
+
+def expected_sky(setup: Setup) -> Modes:
+    """The prior mean of the map's modes and, if the model has them, of those above lmax, in K."""
+    prior, above = setup.prior, setup.above
+    mean = np.zeros(prior.size) if prior.mean is None else np.asarray(prior.mean)
+    return mean if above is None else np.append(mean, above.mean[prior.size :])
+
+
+def of_whole_sky(setup: Setup, inference: Inference) -> Information:
+    """Information in the data about the map's modes and those above lmax, if these are in N."""
+    model, solution = model_of_whole_sky(setup, inference), inference.solution
+    if model is None:
+        return solution.information
+    sky = expected_sky(setup)
+    departure = np.append(solution.posterior.mean, sky[setup.prior.size :]) - sky
+    information = FromInformation.of(model).about(solution.data, departure)
+    misfit = np.asarray(information.misfit - solution.excess)
+    return replace(information, misfit=misfit, reference=sky + departure)
+
+
+def of_map(setup: Setup, information: Information) -> Information:
+    """The same about the map's modes alone; those above lmax have the setup's covariance."""
+    n, above = setup.prior.size, setup.above
+    if above is None or information.n_modes == n:
+        return information
+    return integrated_out(information, n, above.covariance, above.mean[n:])
 
 
 def _compared_surveys(setup: Setup, information: Information, learned: Learned) -> Learned:

@@ -24,6 +24,8 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
 from lusee_bayes.core.checks import Described, number, require_shape
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import lmax_of
+from lusee_bayes.core import linalg
 from lusee_bayes.core.linalg import cholesky, precise_residual, scaled, solve_lower
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.linear.posterior import Posterior
@@ -120,7 +122,12 @@ class Information(Described, eqx.Module):
         InputError
             If it is for another number of modes.
         """
-        require_shape("the other reference sky", other.reference, (self.n_modes,))
+        if other.n_modes != self.n_modes:
+            ends = lmax_of(other.n_modes), lmax_of(self.n_modes)
+            raise InputError(
+                f"the other data describe the sky up to ell = {ends[0]}, these to {ends[1]}; use "
+                "the same lmax, and the same noise.above_lmax"
+            )
         moved = other.recentred(self.reference)
         names = ("matrix", "vector", "misfit", "log_det", "n_data")
         return replace(self, **{n: np.asarray(getattr(self, n) + getattr(moved, n)) for n in names})
@@ -311,7 +318,7 @@ def precision_root(matrix: ModesMatrix, prior: Prior) -> ModesMatrix:
 
 
 def integrated_out(
-    information: Information, n: int, variance: Modes, mean: Modes | None = None
+    information: Information, n: int, variance: Modes | ModesMatrix, mean: Modes | None = None
 ) -> Information:
     """Compute the information about the first unknowns, with the others integrated out.
 
@@ -325,8 +332,8 @@ def integrated_out(
         Of all unknowns.
     n : int
         Number of unknowns that are kept.
-    variance : (others,) array
-        D of the others, in K^2, positive.
+    variance : (others,) or (others, others) array
+        D of the others, or its diagonal, in K^2, positive definite.
     mean : (others,) array, optional
         In K; by default zero.
 
@@ -341,13 +348,19 @@ def integrated_out(
         If ``variance`` has another length.
     """
     others = information.n_modes - n
-    require_shape("the variance", variance, (others,))
+    require_shape("the variance", variance, (others,) * variance.ndim)
     mean = np.zeros(others) if mean is None else mean
     local = information.recentred(np.concatenate([information.reference[:n], mean]))
-    scale = np.sqrt(variance)
-    lower = cholesky(scaled(local.matrix[n:, n:], scale) + np.eye(others))
-    across = solve_lower(lower, scale[:, None] * local.matrix[n:, :n], transpose=False)
-    pull = solve_lower(lower, (scale * local.vector[n:])[:, None], transpose=False)
+    inner, joined = local.matrix[n:, n:], np.c_[local.matrix[n:, :n], local.vector[n:]]
+    if variance.ndim == 1:
+        scale = np.sqrt(variance)
+        inner, joined = scaled(inner, scale), scale[:, None] * joined
+    else:
+        root = linalg.checked_cholesky("the covariance of the others", variance)
+        inner, joined = linalg.sandwich(inner, root), root.T @ joined
+    lower = cholesky(inner + np.eye(others))
+    solved = solve_lower(lower, joined, transpose=False)
+    across, pull = solved[:, :n], solved[:, n:]
     misfit = np.asarray(local.misfit - (pull**2).sum())
     log_det = np.asarray(local.log_det + 2.0 * np.log(np.diagonal(lower)).sum())
     matrix = local.matrix[:n, :n] - across.T @ across

@@ -460,13 +460,13 @@ class FromInformation(Form):
     def condition(self, data: DataVector) -> Solution:
         data, prior = np.asarray(data), self.model.prior
         require_array("the data", data, (self.model.n_data,))
-        u, _, _ = self._about(data, np.zeros(prior.size)).white_mean(prior, self.lower, most=1)
-        information = self._about(data, prior.colour(u))
+        u, _, _ = self.about(data, np.zeros(prior.size)).white_mean(prior, self.lower, most=1)
+        information = self.about(data, prior.colour(u))
         posterior = information.posterior(prior, self.lower)
         return Solution(self.model, data, posterior, self.factor, information)
 
-    def _about(self, data: DataVector, sky: Modes) -> of_data.Information:
-        """Information of the data, about a reference sky."""
+    def about(self, data: DataVector, sky: Modes) -> of_data.Information:
+        """Information of data, about a reference sky in K."""
         offset, n = self.model.offset, self.model.n_data
         white = self.factor.whiten(data - (0.0 if offset is None else offset) - self.coupling @ sky)
         vector = self.coupling.transpose_mv(np.asarray(self.factor.whiten_transpose(white)))

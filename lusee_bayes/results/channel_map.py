@@ -9,6 +9,7 @@ data or those of all channels.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,12 +19,20 @@ from jaxtyping import Float, Int8
 
 from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import mirrored, scaled, solve_lower
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, doubts, infer, posterior_draws, rounds_of
-from lusee_bayes.experiment.rounds import LARGER, Inference
+from lusee_bayes.experiment.rounds import (
+    LARGER,
+    Inference,
+    expected_sky,
+    model_of_whole_sky,
+    of_map,
+    of_whole_sky,
+)
 from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
 from lusee_bayes.experiment.validity import about_sky_above, reach
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
@@ -41,6 +50,10 @@ from lusee_bayes.results.sky_spectrum import Columns, Departure, RegionTemperatu
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference
 
+STRONGER_ABOVE = (
+    "The sky above lmax is not as its prior expects: the data fit only if any sky is allowed there, "
+    "and error bars may be too small. Raise lmax, or learn the prior (prior.model=local_scales)."
+)
 # standard deviation of modes without prior variance, relative to the widest
 EXACT = 1e-12
 # of several channels, groups of data are tested where p of instrument and noise is below this
@@ -75,17 +88,23 @@ def conditioned(
     """
     with rounds_of(experiment, stages or Stages(), "posterior") as report:
         new, data = infer(experiment, report), experiment.data
+        setup, kept = experiment.setup, None
+        if earlier is not None or experiment.scenario.output.information:
+            kept = of_whole_sky(setup, new)
         if earlier is None:
-            return Conditioned(experiment, new, new, new, (data.digest(),))
-        information = earlier.with_more(new.solution.information, data.digest())
-        prior = new.model.prior
+            return Conditioned(experiment, new, new, new, (data.digest(),), kept)
+        kept = earlier.with_more(kept, data.digest())
+        information, prior = of_map(setup, kept), new.model.prior
         posterior = information.posterior(prior)
         information = information.recentred(posterior.mean)
-        before = _given_earlier(earlier.information.posterior(prior))
+        before, whole = earlier.information, model_of_whole_sky(setup, new)
+        if whole is not None:  # the sky above lmax is the same in the earlier data
+            before = replace(before, reference=before.reference - expected_sky(setup))
+        before = _given_earlier(before.posterior(prior if whole is None else whole.prior))
         parts = {"posterior": posterior, "kept_information": information, "excess": 0.0}
         total = replace(new, solution=replace(new.solution, **parts))
-        judged = replace(new, solution=new.under(before).solution)
-        return Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()))
+        judged = replace(new, solution=new.under(before, model=whole).solution)
+        return Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()), kept)
 
 
 def _given_earlier(posterior: Posterior) -> DensePrior:
@@ -112,6 +131,8 @@ class Conditioned:
         The model that predicts these data: its prior is the posterior given the earlier data.
     digests : tuple of str
         Digests of all data.
+    kept : Information or None
+        In all data, to be saved or added (:func:`.of_whole_sky`).
     """
 
     experiment: Experiment
@@ -119,6 +140,7 @@ class Conditioned:
     from_all: Inference
     judged: Inference
     digests: tuple[str, ...]
+    kept: Information | None = None
 
     @property
     def onto(self) -> bool:
@@ -255,7 +277,7 @@ class Conditioned:
         thorough = thorough or inference.size_of_fields > LARGER
         scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
         found: dict[str, Any] = {}
-        judge, unused, left = self.judged.solution, inference.unused(), None
+        judge, unused, left, stronger = self.judged.solution, inference.unused(), None, ()
         if experiment.setup.responses and scenario.sources.treatment != "ignored":
             with stages("fluxes"):
                 found["fluxes"] = flux_table(experiment, inference)
@@ -265,7 +287,7 @@ class Conditioned:
                 instrument = Split.of(*given, None if joint else self.expected).instrument
                 instrument = instrument.allowing(unused)
             if alone or thorough or instrument.p < DOUBTFUL:
-                left = residuals(judge, data, unused, learned=learned is not None)
+                left, stronger = self._residuals(unused)
                 instrument = left.split.instrument
             found["details"] = _details(self) if alone else None
         bad = left is not None and left.level() == "does not fit"
@@ -305,12 +327,28 @@ class Conditioned:
             parameters=() if learned is None else tuple(learned.as_rows()),
             log_evidence_learned=None if learned is None else learned.log_evidence,
             beam_rms_difference=beam_rms_difference(experiment.setup),
-            doubts=(*doubts(experiment, inference), *not_gaussian),
+            doubts=(*doubts(experiment, inference), *stronger, *not_gaussian),
             notes=(*notes, *harmless),
             digests=self.digests,
-            information=self.information if scenario.output.information else None,
+            information=self.kept if scenario.output.information else None,
             **found,
         )
+
+    def _residuals(self, unused: float) -> tuple[Residuals, tuple[str, ...]]:
+        """The data against the model, and a doubt if only another sky above lmax makes them fit."""
+        data, learned = self.experiment.data, self.experiment.learned is not None
+        left, model = residuals(self.judged.solution, data, unused, learned=learned), None
+        if left.level() == "does not fit":
+            model = model_of_whole_sky(self.experiment.setup, self.from_data)
+        if model is None:
+            return left, ()
+        # data that do not fit may need a sky for which float64 has too few digits
+        with suppress(InputError):
+            other = residuals(model.condition(data.data), data, unused, learned=learned)
+            other = replace(other, split=replace(other.split, prior=left.split.prior))
+            if other.level() != "does not fit":
+                return other, (STRONGER_ABOVE,)
+        return left, ()
 
     def _shared(self) -> tuple[WithSky, Columns]:
         """Covariance and w of :class:`.Departure`, in K^2 and K."""

@@ -274,7 +274,9 @@ def read_information(path: Path, channel: Scenario) -> SavedInformation:
                 "its frequencies, or map without --add"
             )
         saved = from_tree(SavedInformation, kept.children[name], str(path))
-    if saved.information.n_modes != harmonics.n_modes(channel.lmax):
+    above = channel.noise.above_lmax
+    ends = channel.lmax, channel.lmax if above is None else above.top(channel.lmax)
+    if saved.information.n_modes not in map(harmonics.n_modes, ends):
         lmax = round(np.sqrt(saved.information.n_modes)) - 1
         raise InputError(
             f"{path} has lmax = {lmax}, the scenario lmax = {channel.lmax}; use --set lmax={lmax}"

@@ -139,4 +139,4 @@ def sky_above(
     directions = np.pad(root @ directions, ((n, 0), (0, 0)))
     expected = np.zeros(len(directions)) if mean is None else np.array(mean)
     expected[:n] = 0.0
-    return Above(coupling, modes, family, directions, expected, power)
+    return Above(coupling, modes, family, covariance, directions, expected, power)

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes
+from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes, ModesMatrix
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.source import BeamSource, Receiver
@@ -50,8 +50,10 @@ class Above:
         Those above lmax of the modelled sky, in K.
     family : PriorFamily or None
         Priors up to the highest ell, from which data choose one; None for a given prior.
+    covariance : (others, others) array
+        Their prior covariance S', in K^2.
     root : (all, rank) array
-        Of the part of their covariance that the data can tell from zero, in K; zero up to lmax.
+        Of the part of S' that the data can tell from zero, in K; zero up to lmax.
     mean : (all,) array
         Their mean, in K; zero up to lmax.
     power : (ells,) array
@@ -61,6 +63,7 @@ class Above:
     coupling: CouplingMatrix
     modes: Modes
     family: PriorFamily | None
+    covariance: ModesMatrix
     root: Float[np.ndarray, "all rank"]
     mean: Float[np.ndarray, " all"]
     power: Float[np.ndarray, " ells"]

@@ -12,12 +12,13 @@ from experiments import channels_of, of_run
 import lusee_bayes as lb
 from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.runs import map_run
+from lusee_bayes.systematics import above_lmax
 
 # N of the parts is that of the whole: about the model, and not about each one's data
 SIZES = ["lmax=4", "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]"]
 SIZES += ["noise.radiometer.temperature=model", "output.information=true"]
 GIVEN, LEARNED = "prior={model: isotropic, spectrum: sky}", "prior={model: isotropic}"
-CUBE = "frequencies_mhz=[20, 25, 30]"
+ABOVE, CUBE = "noise.above_lmax={margin: 8, least_lmax: 0}", "frequencies_mhz=[20, 25, 30]"
 JOINT = ["joint=true", "spectral.components=[power_law]"]
 
 
@@ -27,6 +28,8 @@ pytestmark = pytest.mark.usefixtures("numbers_alone")
 def in_parts(scenario, folder):
     """The run of all data, that of the first part, and that of the second added to the first."""
     whole = channels_of(scenario)
+    if scenario.noise.above_lmax is not None:  # a truth that ends at lmax says that the sky does
+        whole = [replace(data, truth=None) for data in whole]
     first, second = ([of_run(data, k) for data in whole] for k in (0, 1))
     earlier = {"whole": None, "first": None, "both": folder / "first"}
     return [
@@ -41,6 +44,7 @@ SIGMA, EVIDENCE = 1e-4, 1e-3
 
 MAPS = [
     pytest.param([GIVEN], id="map", marks=pytest.mark.long),
+    pytest.param([GIVEN, ABOVE], id="sky above lmax"),
     pytest.param([LEARNED], id="learned map"),
     pytest.param([CUBE, GIVEN], id="independent", marks=pytest.mark.long),
     pytest.param([CUBE, LEARNED], id="learned", marks=pytest.mark.long),
@@ -49,8 +53,9 @@ MAPS = [
 
 
 @pytest.mark.parametrize("kind", MAPS)
-def test_a_map_is_that_of_all_data(kind, tmp_path, exact_tilt):
+def test_a_map_is_that_of_all_data(kind, tmp_path, exact_tilt, monkeypatch):
     """A prior that is learned is learned anew, from all of them."""
+    monkeypatch.setattr(above_lmax, "LEFT_OUT", 1e-9)
     scenario = lb.load_scenario("fiducial", [*SIZES, *kind])
     whole, first, both = in_parts(scenario, tmp_path)
     joint = "joint=true" in kind
