@@ -21,12 +21,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
 from lusee_bayes.core.checks import Described, number, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of
-from lusee_bayes.core import linalg
-from lusee_bayes.core.linalg import cholesky, precise_residual, scaled, solve_lower
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import Prior
@@ -274,12 +273,12 @@ class Information(Described, eqx.Module):
         while unfinished(moved, before, count, most):
             shift = prior.colour(correction)
             if precise:
-                pull = precise_residual(local.vector, local.matrix, shift)
+                pull = linalg.precise_residual(local.vector, local.matrix, shift)
             else:
                 pull = local.vector - local.matrix @ shift
             gradient = prior.colour_columns(pull[None])[0] - (start + correction - expected)
-            half = solve_lower(lower, gradient[:, None], transpose=False)
-            correction = correction + solve_lower(lower, half, transpose=True)[:, 0]
+            half = linalg.solve_lower(lower, gradient[:, None], transpose=False)
+            correction = correction + linalg.solve_lower(lower, half, transpose=True)[:, 0]
             moved, before, count = float(np.linalg.norm(half)), moved, count + 1
         u = start + correction
         log_evidence = -0.5 * (
@@ -314,7 +313,7 @@ def precision_root(matrix: ModesMatrix, prior: Prior) -> ModesMatrix:
         )
     precision = prior.sandwich(matrix)
     precision[np.diag_indices_from(precision)] += 1.0
-    return cholesky(precision, overwrite=True)
+    return linalg.cholesky(precision, overwrite=True)
 
 
 def integrated_out(
@@ -354,12 +353,12 @@ def integrated_out(
     inner, joined = local.matrix[n:, n:], np.c_[local.matrix[n:, :n], local.vector[n:]]
     if variance.ndim == 1:
         scale = np.sqrt(variance)
-        inner, joined = scaled(inner, scale), scale[:, None] * joined
+        inner, joined = linalg.scaled(inner, scale), scale[:, None] * joined
     else:
         root = linalg.checked_cholesky("the covariance of the others", variance)
         inner, joined = linalg.sandwich(inner, root), root.T @ joined
-    lower = cholesky(inner + np.eye(others))
-    solved = solve_lower(lower, joined, transpose=False)
+    lower = linalg.cholesky(inner + np.eye(others))
+    solved = linalg.solve_lower(lower, joined, transpose=False)
     across, pull = solved[:, :n], solved[:, n:]
     misfit = np.asarray(local.misfit - (pull**2).sum())
     log_det = np.asarray(local.log_det + 2.0 * np.log(np.diagonal(lower)).sum())

@@ -23,16 +23,9 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import mirrored, scaled, solve_lower
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment import rounds
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, doubts, infer, posterior_draws, rounds_of
-from lusee_bayes.experiment.rounds import (
-    LARGER,
-    Inference,
-    expected_sky,
-    model_of_whole_sky,
-    of_map,
-    of_whole_sky,
-)
 from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
 from lusee_bayes.experiment.validity import about_sky_above, reach
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
@@ -51,7 +44,7 @@ from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference
 
 STRONGER_ABOVE = (
-    "The sky above lmax is not as its prior expects: the data fit only if any sky is allowed there, "
+    "The sky above lmax is not as its prior expects: data fit only if any sky is allowed there, "
     "and error bars may be too small. Raise lmax, or learn the prior (prior.model=local_scales)."
 )
 # standard deviation of modes without prior variance, relative to the widest
@@ -90,16 +83,16 @@ def conditioned(
         new, data = infer(experiment, report), experiment.data
         setup, kept = experiment.setup, None
         if earlier is not None or experiment.scenario.output.information:
-            kept = of_whole_sky(setup, new)
+            kept = rounds.of_whole_sky(setup, new)
         if earlier is None:
             return Conditioned(experiment, new, new, new, (data.digest(),), kept)
         kept = earlier.with_more(kept, data.digest())
-        information, prior = of_map(setup, kept), new.model.prior
+        information, prior = rounds.of_map(setup, kept), new.model.prior
         posterior = information.posterior(prior)
         information = information.recentred(posterior.mean)
-        before, whole = earlier.information, model_of_whole_sky(setup, new)
+        before, whole = earlier.information, rounds.model_of_whole_sky(setup, new)
         if whole is not None:  # the sky above lmax is the same in the earlier data
-            before = replace(before, reference=before.reference - expected_sky(setup))
+            before = replace(before, reference=before.reference - rounds.expected_sky(setup))
         before = _given_earlier(before.posterior(prior if whole is None else whole.prior))
         parts = {"posterior": posterior, "kept_information": information, "excess": 0.0}
         total = replace(new, solution=replace(new.solution, **parts))
@@ -123,11 +116,11 @@ class Conditioned:
     Attributes
     ----------
     experiment : Experiment
-    from_data : Inference
+    from_data : rounds.Inference
         Given these data alone.
-    from_all : Inference
+    from_all : rounds.Inference
         The model of these data, and the posterior given all data.
-    judged : Inference
+    judged : rounds.Inference
         The model that predicts these data: its prior is the posterior given the earlier data.
     digests : tuple of str
         Digests of all data.
@@ -136,9 +129,9 @@ class Conditioned:
     """
 
     experiment: Experiment
-    from_data: Inference
-    from_all: Inference
-    judged: Inference
+    from_data: rounds.Inference
+    from_all: rounds.Inference
+    judged: rounds.Inference
     digests: tuple[str, ...]
     kept: Information | None = None
 
@@ -274,7 +267,7 @@ class Conditioned:
             Test groups of data and try the usual mistakes even if the data fit.
         """
         experiment, inference, stages = self.experiment, self.from_data, stages or Stages()
-        thorough = thorough or inference.size_of_fields > LARGER
+        thorough = thorough or inference.size_of_fields > rounds.LARGER
         scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
         found: dict[str, Any] = {}
         judge, unused, left, stronger = self.judged.solution, inference.unused(), None, ()
@@ -339,7 +332,7 @@ class Conditioned:
         data, learned = self.experiment.data, self.experiment.learned is not None
         left, model = residuals(self.judged.solution, data, unused, learned=learned), None
         if left.level() == "does not fit":
-            model = model_of_whole_sky(self.experiment.setup, self.from_data)
+            model = rounds.model_of_whole_sky(self.experiment.setup, self.from_data)
         if model is None:
             return left, ()
         # data that do not fit may need a sky for which float64 has too few digits

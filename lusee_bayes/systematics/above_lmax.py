@@ -17,7 +17,7 @@ Simulated data contain the modes of the scenario's sky up to the same ell.
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -70,9 +70,7 @@ class AboveLmax(LowRankNoise):
         A' mu', in K.
     """
 
-    key: ClassVar[str] = "noise.above_lmax"
-    section: ClassVar[type[Section]] = AboveLmaxSection
-    words: ClassVar[str] = "the sky above lmax"
+    key, section, words = "noise.above_lmax", AboveLmaxSection, "the sky above lmax"
 
     mean: DataVector
 

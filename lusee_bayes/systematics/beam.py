@@ -67,11 +67,8 @@ class BeamErrorSection(Section):
 class BeamErrors(Systematic):
     """Errors of the beams, of either kind."""
 
-    key: ClassVar[str] = "noise.beam"
-    section: ClassVar[type[Section]] = BeamErrorSection
-    words: ClassVar[str] = "the beams"
-    draw: ClassVar[int] = 3
-    moves_setup: ClassVar[bool] = True
+    key, section, words, draw = "noise.beam", BeamErrorSection, "the beams", 3
+    moves_setup = True
 
     @classmethod
     def in_rounds(cls, section: BeamErrorSection) -> bool:
@@ -173,7 +170,7 @@ class BeamError(BeamErrors):
     """
 
     unknowns: ClassVar[tuple[Unknown, ...]] = (Unknown("beam_amplitude"),)
-    first_order: ClassVar[bool] = False
+    first_order = False
 
     direction: CouplingMatrix
 

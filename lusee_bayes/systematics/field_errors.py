@@ -22,7 +22,7 @@ the rest has only a few shapes, for which the strength of all would be far too l
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
@@ -92,11 +92,8 @@ class FieldErrors(ChangedBeams):
         The scenario's section.
     """
 
-    key: ClassVar[str] = "noise.fields"
-    section: ClassVar[type[Section]] = FieldErrorsSection
-    words: ClassVar[str] = "the fields"
-    moves_setup: ClassVar[bool] = True
-    has_table: ClassVar[bool] = True
+    key, section, words = "noise.fields", FieldErrorsSection, "the fields"
+    moves_setup, has_table = True, True
 
     of_ell: Float[Array, " ells"]
     fields: Complex[Array, "ports 2 rings phi"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -114,12 +114,8 @@ class GainDrifts(systematic.Systematic):
         F (C_g slope - found): the mean of the data minus the response to the found drifts, in K.
     """
 
-    key: ClassVar[str] = "noise.gain"
-    section: ClassVar[type[Section]] = GainSection
-    draw: ClassVar[int] = 2
-    needs_sky: ClassVar[bool] = True
-    scales_sky: ClassVar[bool] = True
-    first_order: ClassVar[bool] = False
+    key, section, draw = "noise.gain", GainSection, 2
+    needs_sky, scales_sky, first_order = True, True, False
 
     drift: GainDrift
     visibilities: Float[Array, "products times"]

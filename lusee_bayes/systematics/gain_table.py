@@ -12,7 +12,7 @@ mode of all unknowns.
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
@@ -66,13 +66,8 @@ class GainTable(Systematic):
         The data.
     """
 
-    key: ClassVar[str] = "noise.gain_table"
-    section: ClassVar[type[Section]] = GainTableSection
-    words: ClassVar[str] = "the gain table"
-    draw: ClassVar[int] = 10
-    changes_coupling: ClassVar[bool] = False
-    moves: ClassVar[bool] = True
-    scales_sky: ClassVar[bool] = True
+    key, section, words, draw = "noise.gain_table", GainTableSection, "the gain table", 10
+    changes_coupling, moves, scales_sky = False, True, True
 
     errors: tuple[str, ...] = eqx.field(static=True)
     port: tuple[int, ...] = eqx.field(static=True)

@@ -30,7 +30,7 @@ with the lander, and that point sources set behind it.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
@@ -151,11 +151,8 @@ class Horizon(ChangedBeams):
         Temperature of the terrain, in K.
     """
 
-    key: ClassVar[str] = "noise.horizon"
-    section: ClassVar[type[Section]] = HorizonSection
-    words: ClassVar[str] = "the horizon"
-    unit: ClassVar[str] = "deg"
-    moves_setup: ClassVar[bool] = True
+    key, section, words, unit = "noise.horizon", HorizonSection, "the horizon", "deg"
+    moves_setup = True
 
     unknowns: tuple[Unknown, ...] = eqx.field()
     patterns: Float[Array, "products rings azimuths"]

@@ -6,7 +6,7 @@ There is no Gaussian term for a factor of a variance: if marginalised, the level
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import numpy as np
@@ -61,9 +61,7 @@ class NoiseLevel(Scale):
         The factor, whose median is one.
     """
 
-    key: ClassVar[str] = "noise.radiometer"
-    section: ClassVar[type[Section]] = RadiometerSection
-    draw: ClassVar[int] = 4
+    key, section, draw = "noise.radiometer", RadiometerSection, 4
 
     unknowns: tuple[Unknown, ...] = eqx.field()
 

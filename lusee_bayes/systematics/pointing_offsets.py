@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -102,13 +102,8 @@ class PointingOffsets(Systematic):
         The point sources; None if the model has none.
     """
 
-    key: ClassVar[str] = "noise.pointing"
-    section: ClassVar[type[Section]] = PointingSection
-    words: ClassVar[str] = "clock and pointing"
-    draw: ClassVar[int] = 7
-    moves: ClassVar[bool] = True
-    moves_setup: ClassVar[bool] = True
-    has_table: ClassVar[bool] = True
+    key, section, words, draw = "noise.pointing", PointingSection, "clock and pointing", 7
+    moves, moves_setup, has_table = True, True, True
 
     unknowns: tuple[Unknown, ...] = eqx.field()
     expansion_point: Float[Array, "2"]
@@ -179,7 +174,12 @@ class PointingOffsets(Systematic):
         K_k of turns about its axes. JAX differentiates only w(z), which compiles quickly.
         """
         pointing = self.turned(self.values(centre))
-        orientation, slopes, of_sources = _slopes(*on_device((self, centre)))
+        device, of_sources = on_device(self), 0.0
+        orientation, slopes = _slopes(*on_device((self, centre)))
+        if self.sources is not None:  # the derivative of their beams would compile for a minute
+            seen = eqx.filter_jit(lambda at: device.sources.seen(at, device.layout))
+            ways = self.differences(lambda values: seen(device.orientation(values)), centre)
+            of_sources = np.stack([*ways], axis=1)
         turn = np.einsum("tji,tjkn->tikn", np.asarray(orientation), np.asarray(slopes))
         beams, ways = [], []
         for axis in range(3):
@@ -190,8 +190,7 @@ class PointingOffsets(Systematic):
 
         def columns(sky):
             turned = zip(see(sky), ways, strict=True)
-            seen = sum(self.layout.gather(one)[:, None] * way for one, way in turned)
-            return seen if of_sources is None else seen + np.asarray(of_sources)
+            return of_sources + sum(self.layout.gather(one)[:, None] * way for one, way in turned)
 
         return columns
 
@@ -210,14 +209,13 @@ class PointingOffsets(Systematic):
 
 
 @eqx.filter_jit
-def _slopes(offsets: PointingOffsets, centre: Array) -> tuple[Array, Array, Array | None]:
-    """The orientation, and its derivative and that of the sources' signal by the offsets."""
+def _slopes(offsets: PointingOffsets, centre: Array) -> tuple[Array, Array]:
+    """The orientation, and its derivative by the offsets."""
 
-    def seen(z: Array) -> tuple[Array, Array | None]:
-        orientation, sources = offsets.orientation(offsets.values(z)), offsets.sources
-        return orientation, None if sources is None else sources.seen(orientation, offsets.layout)
+    def at(z: Array) -> Array:
+        return offsets.orientation(offsets.values(z))
 
-    return seen(centre)[0], *jax.jacfwd(seen)(centre)
+    return at(centre), jax.jacfwd(at)(centre)
 
 
 def _about(axis: int, angle: float | Array) -> Float[Array, "*batch 3 3"]:

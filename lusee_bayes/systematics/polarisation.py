@@ -34,7 +34,7 @@ Zaldarriaga and Seljak 1997, PRD 55, 1830; Kamionkowski, Kosowsky and Stebbins 1
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -90,9 +90,7 @@ class Polarisation(LowRankNoise):
     interpolated fields, with the scale of the beams.
     """
 
-    key: ClassVar[str] = "noise.polarisation"
-    section: ClassVar[type[Section]] = PolarisationSection
-    words: ClassVar[str] = "the polarised sky"
+    key, section, words = "noise.polarisation", PolarisationSection, "the polarised sky"
 
     @classmethod
     def treatment(cls, scenario: Any) -> str | None:

@@ -7,7 +7,7 @@ not depend on them.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -68,9 +68,9 @@ class PriorSpectrum(Scale):
         First ell of every band except the lowest, increasing; empty for no bands.
     """
 
-    key: ClassVar[str] = "prior"
+    key = "prior"
     # its true values are the sky's own
-    moves_setup: ClassVar[bool] = True
+    moves_setup = True
 
     unknowns: tuple[Unknown, ...] = eqx.field()
     edges: tuple[int, ...] = eqx.field(static=True)

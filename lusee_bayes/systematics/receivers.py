@@ -6,7 +6,7 @@ port's deviations from it.
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import jax
 import numpy as np
@@ -83,10 +83,7 @@ class ReceiverNoiseSection(Section):
 class Receivers(Temperatures):
     """Powers of the receivers, each in its port's auto."""
 
-    key: ClassVar[str] = "noise.receiver"
-    section: ClassVar[type[Section]] = ReceiverNoiseSection
-    words: ClassVar[str] = "the receivers"
-    draw: ClassVar[int] = 8
+    key, section, words, draw = "noise.receiver", ReceiverNoiseSection, "the receivers", 8
 
     @classmethod
     def octaves(cls, section: ReceiverNoiseSection) -> float:

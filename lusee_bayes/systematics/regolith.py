@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -35,10 +34,7 @@ class RegolithSection(Section):
 class RegolithTemperature(Temperatures):
     """Temperature of the ground."""
 
-    key: ClassVar[str] = "noise.regolith"
-    section: ClassVar[type[Section]] = RegolithSection
-    words: ClassVar[str] = "the regolith"
-    draw: ClassVar[int] = 9
+    key, section, words, draw = "noise.regolith", RegolithSection, "the regolith", 9
 
     @classmethod
     def build(cls, section: RegolithSection, setup: Setup, around: Around):

@@ -6,7 +6,7 @@ source may have one for each block of time.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -132,12 +132,8 @@ class PointSources(Systematic):
         Response to 1 K sr of each source in each of its blocks of time, in K per K sr.
     """
 
-    key: ClassVar[str] = "sources"
-    words: ClassVar[str] = "the sources"
-    unit: ClassVar[str] = "K sr"
-    draw: ClassVar[int] = 5
-    changes_coupling: ClassVar[bool] = False
-    has_table: ClassVar[bool] = True
+    key, words, unit, draw = "sources", "the sources", "K sr", 5
+    changes_coupling, has_table = False, True
 
     unknowns: tuple[Unknown, ...] = eqx.field()
     columns: Float[Array, "data fluxes"]

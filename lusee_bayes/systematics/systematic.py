@@ -461,6 +461,14 @@ class Systematic(eqx.Module):
         around = Around(sky=model.prior.colour(model.prior.white_mean))
         return Expanded.at(self, model, around).marginalised(model)
 
+    def differences(
+        self, made: Callable[[Values], Array], centre: Vector
+    ) -> Iterator[Float[np.ndarray, "..."]]:
+        """Derivatives of a function of the values by the unknowns in prior std's, one by one."""
+        for step in STEP * np.eye(len(centre)):
+            up, down = (np.asarray(made(self.values(centre + way))) for way in (step, -step))
+            yield (up - down) / (2.0 * STEP)
+
     def averaged(self, model: LinearGaussian) -> LinearGaussian:
         """The same, except that N does not change."""
         return replace(self.marginalised(model), noise=model.noise)
@@ -590,14 +598,6 @@ class ChangedBeams(Systematic):
     @abstractmethod
     def modes(self, modes: BeamModes, values: Values) -> BeamModes:
         """Beams in the frame of the lander with values of the unknowns, from beams without them."""
-
-    def differences(
-        self, made: Callable[[Values], Array], centre: Vector
-    ) -> Iterator[Float[np.ndarray, "..."]]:
-        """Derivatives of a function of the values by the unknowns in prior std's, one by one."""
-        for step in STEP * np.eye(len(centre)):
-            up, down = (np.asarray(made(self.values(centre + way))) for way in (step, -step))
-            yield (up - down) / (2.0 * STEP)
 
     def effect(self, model, values):
         """Use A of these beams."""
