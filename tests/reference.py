@@ -129,8 +129,7 @@ def arm_response(
     A plane wave comes from n with its electric field along e; its mirror image in the ground at
     z = -height comes from n' with the field e' that the reflection (s, p) leaves.
     """
-    k = 2.0e6 * np.pi * frequency_mhz / SPEED_OF_LIGHT
-    s = np.linspace(0.0, length, steps)
+    k, s = 2.0e6 * np.pi * frequency_mhz / SPEED_OF_LIGHT, np.linspace(0.0, length, steps)
     current = np.sin(k * (length - s))
     n, (e_theta, e_phi) = vectors(theta, phi), tangents(theta, phi)
     mirrored = n * np.array([1.0, 1.0, -1.0])

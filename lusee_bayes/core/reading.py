@@ -55,8 +55,7 @@ def require_file(path: str | Path, what: str, hint: str = "") -> Path:
     try:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError) as error:
-        hint = f"; {hint}" if hint else ""
-        raise InputError(f"no {_kind(what)} at '{path}'{hint}") from error
+        raise InputError(f"no {_kind(what)} at '{path}'{f'; {hint}' if hint else ''}") from error
     except (OSError, ValueError) as error:
         # the name is too long, contains NUL, or has a file as a parent
         raise InputError(f"no {_kind(what)} at '{path}': {_reason(error)}") from error

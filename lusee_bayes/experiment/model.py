@@ -28,6 +28,7 @@ from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, KnownFactor, LowRankUpdate
 from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.sky.sky_source import Sky
+from lusee_bayes.systematics import systematic as kinds
 from lusee_bayes.systematics.above_lmax import AboveLmax, sky_above
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities, prior_and_family
 from lusee_bayes.systematics.gain_drifts import GainDrifts
@@ -36,14 +37,6 @@ from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.registered import present
 from lusee_bayes.systematics.regolith import ground_per_kelvin
 from lusee_bayes.systematics.sources import source_responses
-from lusee_bayes.systematics.systematic import (
-    ChangedBeams,
-    Expanded,
-    Marginalised,
-    Scale,
-    Systematic,
-    Truth,
-)
 
 # sites closer than this, 30 m, count as one
 SAME_SITE_DEG = 1e-3
@@ -109,7 +102,7 @@ def set_up(
 
 
 def with_sky_above(
-    setup: Setup, covariance: ModesMatrix | None = None, values: Truth | None = None
+    setup: Setup, covariance: ModesMatrix | None = None, values: kinds.Truth | None = None
 ) -> Setup:
     """Add the sky above lmax to a setup, if it is part of the model.
 
@@ -127,7 +120,7 @@ def with_sky_above(
     return replace(setup, above=sky_above(setup, coupling, radiometer(setup), covariance))
 
 
-def _coupling_above(setup: Setup, values: Truth) -> CouplingMatrix:
+def _coupling_above(setup: Setup, values: kinds.Truth) -> CouplingMatrix:
     """A of all modes up to the highest ell that is seen, for these values of the instrument."""
     scenario = setup.scenario.with_section("sources", list=())
     top = scenario.noise.above_lmax.top(scenario.lmax)
@@ -182,7 +175,7 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     return noise.scaled(around.tempered)
 
 
-def moved(setup: Setup, values: Truth | None, *, above: bool = False) -> Setup:
+def moved(setup: Setup, values: kinds.Truth | None, *, above: bool = False) -> Setup:
     """The setup with these values of the instrument, and its signal for them.
 
     Parameters
@@ -202,7 +195,7 @@ def moved(setup: Setup, values: Truth | None, *, above: bool = False) -> Setup:
     return made.with_signal()
 
 
-def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, Systematic]]:
+def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, kinds.Systematic]]:
     """Treatment and systematic, for all that the scenario does not ignore, in order.
 
     If the instrument is expanded around values, such as clock and pointing offsets, all systematics
@@ -224,8 +217,8 @@ def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
 
 
 def in_noise(
-    setup: Setup, model: LinearGaussian, terms: Iterable[Systematic], around: Around
-) -> list[Marginalised]:
+    setup: Setup, model: LinearGaussian, terms: Iterable[kinds.Systematic], around: Around
+) -> list[kinds.Marginalised]:
     """Systematics as terms of N, in order, built around given values.
 
     Parameters
@@ -250,18 +243,20 @@ def in_noise(
     last, held = model.coupling.response, []
     for systematic, before, response in stages:
         later = last if response is None or last is None else last / response
-        if isinstance(systematic, ChangedBeams):  # of the antennas as they point
+        if isinstance(systematic, kinds.ChangedBeams):  # of the antennas as they point
             before = replace(before, coupling=before.coupling.of(pointing=model.coupling.pointing))
         if systematic.first_order:
-            held.append(on_host(Expanded.at(systematic, before, around, later)))
+            held.append(on_host(kinds.Expanded.at(systematic, before, around, later)))
         else:
-            held.append(Marginalised(systematic if later is None else systematic.behind(later)))
+            held.append(
+                kinds.Marginalised(systematic if later is None else systematic.behind(later))
+            )
     return held
 
 
 def model_about(
     setup: Setup, around: Around, *, moving: bool = True
-) -> tuple[LinearGaussian, tuple[Marginalised, ...]]:
+) -> tuple[LinearGaussian, tuple[kinds.Marginalised, ...]]:
     """The full model, and the systematics in its N.
 
     Parameters
@@ -287,7 +282,7 @@ def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     return model_about(setup, around or Around())[0]
 
 
-class InPlace(Marginalised):
+class InPlace(kinds.Marginalised):
     """A systematic at its place among sampled ones, in a model whose N contains it already.
 
     Attributes
@@ -303,7 +298,7 @@ class InPlace(Marginalised):
 
 def model_to_sample(
     setup: Setup, around: Around
-) -> tuple[LinearGaussian, tuple[Systematic | Marginalised, ...]]:
+) -> tuple[LinearGaussian, tuple[kinds.Systematic | kinds.Marginalised, ...]]:
     """The model before sampling, and the systematics to apply to it.
 
     Marginalised systematics keep their place in the order, like sampled ones without a site, since
@@ -325,28 +320,28 @@ def model_to_sample(
             later.append(as_noise)
         else:
             model = as_noise.marginalised(model)
-    if later and not any(isinstance(systematic, Scale) for systematic in sampled):
+    if later and not any(isinstance(systematic, kinds.Scale) for systematic in sampled):
         noise, gains = on_device(whole.noise), any(s.scales_sky or s.needs_sky for s in sampled)
         if gains and isinstance(noise, LowRankUpdate):
             noise = replace(noise, base=KnownFactor(noise.base, noise.base.factor()))
         else:
             noise = KnownFactor(noise, noise.factor())
         model = replace(model, noise=noise)
-        later = [InPlace(s) if isinstance(s, Marginalised) else s for s in later]
+        later = [InPlace(s) if isinstance(s, kinds.Marginalised) else s for s in later]
     if later and not any(systematic.changes_coupling for systematic in later):
         model = replace(model, coupling=DenseCoupling(model.coupling.dense()))
     return model, tuple(later)
 
 
-def true_values(setup: Setup) -> Truth:
+def true_values(setup: Setup) -> kinds.Truth:
     """True values of the systematics in simulated data, by the names of their sites."""
-    truth: Truth = {}
+    truth: kinds.Truth = {}
     for cls, section in present(setup.scenario):
         truth |= cls.truth(section, setup, jax.random.key(cls.true_seed(section, setup.scenario)))
     return truth
 
 
-def true_model(setup: Setup, truth: Truth) -> LinearGaussian:
+def true_model(setup: Setup, truth: kinds.Truth) -> LinearGaussian:
     """The model of simulated data: true instrument, true values and radiometer noise."""
     key, true = jax.random.key(setup.scenario.seed), moved(setup, truth, above=True)
     model = LinearGaussian(true.coupling, setup.prior, radiometer(setup), true.offset)
@@ -355,7 +350,7 @@ def true_model(setup: Setup, truth: Truth) -> LinearGaussian:
     return model
 
 
-def true_signal(setup: Setup, truth: Truth) -> Grid:
+def true_signal(setup: Setup, truth: kinds.Truth) -> Grid:
     """Visibilities of sky, ground and systematics with the true instrument and values, in K."""
     return setup.layout.scatter(true_model(setup, truth).predict(setup.sky.modes))
 

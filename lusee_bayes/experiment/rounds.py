@@ -198,15 +198,9 @@ class Inference:
         skies = [mean, *([self.around.sky] if self.moving else [])]
         return max(float(self.posterior.rms_shift_from(sky)) for sky in skies)
 
-    def under(
-        self, prior: Prior, learned: Learned | None = None, model: LinearGaussian | None = None
-    ) -> Inference:
-        """The inference under another prior, with how it was learned; or for another sky."""
-        solution = self.solution
-        if model is None:
-            solution = solution.under(prior)
-        else:
-            solution = replace(model, prior=prior).condition(solution.data)
+    def under(self, prior: Prior, learned: Learned | None = None) -> Inference:
+        """The inference under another prior, with how it was learned."""
+        solution = self.solution.under(prior)
         return replace(self, solution=_less_moved(solution, self.systematics), learned=learned)
 
 
@@ -680,10 +674,9 @@ def of_whole_sky(setup: Setup, inference: Inference) -> Information:
 
 def of_map(setup: Setup, information: Information) -> Information:
     """The same about the map's modes alone; those above lmax have the setup's covariance."""
-    n, above = setup.prior.size, setup.above
-    if above is None or information.n_modes == n:
+    if information.n_modes == (n := setup.prior.size):
         return information
-    return integrated_out(information, n, above.covariance, above.mean[n:])
+    return integrated_out(information, n, setup.above.covariance, setup.above.mean[n:])
 
 
 def _compared_surveys(setup: Setup, information: Information, learned: Learned) -> Learned:

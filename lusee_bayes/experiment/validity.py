@@ -194,8 +194,7 @@ def errors_of(setup: Setup, model: LinearGaussian, sky: Modes, has: set[str]) ->
     """
 
     def columns(systematic: Systematic) -> Columns:
-        centre = np.zeros(len(systematic.names))
-        return np.asarray(systematic.linearised(model, centre)(sky))
+        return np.asarray(systematic.linearised(model, np.zeros(len(systematic.names)))(sky))
 
     source = setup.beam_source
     if source.has_fields and FieldErrors.treatment(setup.scenario) in (None, "ignored"):
@@ -210,8 +209,7 @@ def errors_of(setup: Setup, model: LinearGaussian, sky: Modes, has: set[str]) ->
     steps = {name: step for name, step in tested_offsets(setup).items() if name not in has}
     if steps:
         steps |= {"clock_s": CLOCK_S} if "clock_s" in steps else {}
-        offsets = PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0))
-        yield steps, "", 1, columns(offsets)
+        yield steps, "", 1, columns(PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0)))
     if setup.hidden is None:
         half = TERRAIN_DEG / 2.0
         terrain = HorizonSection(altitude_deg=half, std_deg=half, harmonics=1, treatment="ignored")

@@ -301,8 +301,7 @@ class Disturbances:
         level = np.einsum("iirc->rc", t).real / (session.PORTS * np.sqrt(frames))
         comb = np.arange(session.N_CHANNELS) % flags.COMB_SPACING == flags.COMB_FIRST
         lines = self.section.tone_factor * (self.tone[rows, None] & self.tone_channel)
-        lines = lines + self.section.comb_factor * (self.comb[rows, None] & comb)
-        t += level * lines
+        t += level * (lines + self.section.comb_factor * (self.comb[rows, None] & comb))
         if (bursts := np.flatnonzero(self.burst[rows])).size:
             wave = np.exp(1j * self.phase[rows][bursts]).T
             power = level[bursts] * self.section.burst_factor / np.sqrt(BURST_CHANNELS)

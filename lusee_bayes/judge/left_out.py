@@ -527,8 +527,7 @@ def roots(weights: Weights, chosen: CellFlags) -> Roots:
     some, within = chosen[:, used], weights[:, used]
     if weights.ndim == 2:
         return np.where(some, np.sqrt(within), 1.0)
-    both = some[:, :, None] & some[:, None]
-    blocks = np.where(both, within[..., used], np.eye(len(used)))
+    blocks = np.where(some[:, :, None] & some[:, None], within[..., used], np.eye(len(used)))
     try:
         return np.linalg.cholesky(blocks)
     except np.linalg.LinAlgError:  # NaN where there is none

@@ -492,8 +492,7 @@ def tie(
     lower = np.linalg.cholesky(np.eye(root.shape[1]) + root.T @ pulled.reshape(root.shape))
     white, z = np.zeros(root.shape[1]), np.zeros(mean.shape)
     for _ in range(1 + REFINEMENTS):
-        pull = np.einsum("kij,kj->ki", inverse, mean - z) + z
-        left = (root.T @ pull.ravel() - white)[:, None]
+        left = (root.T @ (np.einsum("kij,kj->ki", inverse, mean - z) + z).ravel() - white)[:, None]
         step = solve_lower(lower, solve_lower(lower, left, transpose=False), transpose=True)
         white = white + step[:, 0]
         z = (root @ white).reshape(mean.shape)

@@ -25,7 +25,6 @@ from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
 from lusee_bayes.core.checks import Described, number, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import Prior
@@ -121,12 +120,8 @@ class Information(Described, eqx.Module):
         InputError
             If it is for another number of modes.
         """
-        if other.n_modes != self.n_modes:
-            ends = lmax_of(other.n_modes), lmax_of(self.n_modes)
-            raise InputError(
-                f"the other data describe the sky up to ell = {ends[0]}, these to {ends[1]}; use "
-                "the same lmax, and the same noise.above_lmax"
-            )
+        what = "the sky of the other data (use one lmax and noise.above_lmax for all)"
+        require_shape(what, other.reference, (self.n_modes,))
         moved = other.recentred(self.reference)
         names = ("matrix", "vector", "misfit", "log_det", "n_data")
         return replace(self, **{n: np.asarray(getattr(self, n) + getattr(moved, n)) for n in names})

@@ -42,8 +42,7 @@ class ChannelCouplings(Coupling):
 
     @property
     def shape(self) -> tuple[int, int]:
-        n_modes = self.matrices[0].shape[1]
-        return sum(map(len, self.matrices)), self.mixing.shape[1] * n_modes
+        return sum(map(len, self.matrices)), self.mixing.shape[1] * self.matrices[0].shape[1]
 
     def skies(self, maps: Float[Array, "unknowns *n"]) -> Float[Array, "channels modes *n"]:
         """Skies of all channels, given all maps in one vector."""

@@ -266,8 +266,7 @@ def _linear_round(
     def relative(channel: int, information: Information) -> Information:
         return linearised(skies, channel, information, point.exponents[channel])
 
-    information = channels.summed(prior, point.exponents, relative)
-    posterior = joint.component_posterior(information, prior)
+    posterior = joint.component_posterior(channels.summed(prior, point.exponents, relative), prior)
     mean = np.asarray(posterior.mean)
     spread = joint.paired(posterior.covariance(), prior) if learn else None
 

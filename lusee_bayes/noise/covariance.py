@@ -51,8 +51,7 @@ class Factor(eqx.Module):
         Largest variance of a datum over that which others leave, where blocks would be inverted.
     """
 
-    couples_times: ClassVar[bool] = True
-    collinearity = 1.0
+    couples_times, collinearity = True, 1.0
 
     @abstractmethod
     def whiten(self, x: Columns) -> Columns:
@@ -483,10 +482,9 @@ class LowRankFactor(Factor):
     def _shrink(self, x: Array, *, transpose: bool) -> Array:
         """B x, or B^T x with ``transpose``."""
         columns = x.reshape(x.shape[0], -1)
-        inner = self.v.T @ columns
         roots = self.lower, self.lower + np.eye(self.lower.shape[0])
         first, second = roots if transpose else roots[::-1]
-        inner = solve_lower(first, inner, transpose=False)
+        inner = solve_lower(first, self.v.T @ columns, transpose=False)
         inner = solve_lower(second, inner, transpose=True)
         return (columns - self.v @ inner).reshape(x.shape)
 

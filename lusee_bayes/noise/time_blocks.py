@@ -317,8 +317,7 @@ def _cholesky(left: Array, diagonal: Array) -> tuple[Array, Array]:
         solved = linalg.solve_lower(reach, before.T, transpose=False).T
         # Cholesky's value needs the lower triangle only, its derivative a symmetric matrix
         schur = jnp.tril(on - solved @ solved.T)
-        schur = schur + jnp.tril(schur, -1).T
-        lower = jax.lax.linalg.cholesky(schur, symmetrize_input=False)
+        lower = jax.lax.linalg.cholesky((schur + jnp.tril(schur, -1).T), symmetrize_input=False)
         shifted = jnp.zeros_like(reach).at[:-rows, :-rows].set(reach[rows:, rows:])
         new = jnp.concatenate([solved[:, rows:], jnp.tril(lower)], axis=1)
         return shifted.at[-rows:].set(new), (solved, jnp.tril(lower))

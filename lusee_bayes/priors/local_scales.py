@@ -224,8 +224,7 @@ class LocalScales(PriorFamily):
                 rows[:, 0] = 0.0
             spread = np.einsum("ij,ij->i", rows @ covariance, rows)
             strengths.append(strength * np.exp(0.5 * spread))
-        spread = np.einsum("ij,jk,ik->i", sizes, covariance, sizes)
-        sizes = np.exp(member.sizes + 0.5 * spread)
+        sizes = np.exp(member.sizes + 0.5 * np.einsum("ij,jk,ik->i", sizes, covariance, sizes))
         return _covariance(self, sizes, _texture(self, member.spectrum, strengths))
 
     def prior(self, covariance):

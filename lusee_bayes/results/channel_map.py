@@ -43,10 +43,8 @@ from lusee_bayes.results.sky_spectrum import Columns, Departure, RegionTemperatu
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference
 
-STRONGER_ABOVE = (
-    "The sky above lmax is not as its prior expects: data fit only if any sky is allowed there, "
-    "and error bars may be too small. Raise lmax, or learn the prior (prior.model=local_scales)."
-)
+STRONGER_ABOVE = """The sky above lmax is not as its prior expects: data fit only if any is allowed
+there, and error bars may be too small. Raise lmax, or use prior.model=local_scales."""
 # standard deviation of modes without prior variance, relative to the widest
 EXACT = 1e-12
 # of several channels, groups of data are tested where p of instrument and noise is below this
@@ -91,12 +89,15 @@ def conditioned(
         posterior = information.posterior(prior)
         information = information.recentred(posterior.mean)
         before, whole = earlier.information, rounds.model_of_whole_sky(setup, new)
-        if whole is not None:  # the sky above lmax is the same in the earlier data
+        if whole is None:
+            judge = new.under(_given_earlier(before.posterior(prior))).solution
+        else:  # the sky above lmax is the same in the earlier data
             before = replace(before, reference=before.reference - rounds.expected_sky(setup))
-        before = _given_earlier(before.posterior(prior if whole is None else whole.prior))
+            whole = replace(whole, prior=_given_earlier(before.posterior(whole.prior)))
+            judge = whole.condition(data.data).less(new.solution.excess)
         parts = {"posterior": posterior, "kept_information": information, "excess": 0.0}
         total = replace(new, solution=replace(new.solution, **parts))
-        judged = replace(new, solution=new.under(before, model=whole).solution)
+        judged = replace(new, solution=judge)
         return Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()), kept)
 
 
@@ -340,7 +341,7 @@ class Conditioned:
             other = residuals(model.condition(data.data), data, unused, learned=learned)
             other = replace(other, split=replace(other.split, prior=left.split.prior))
             if other.level() != "does not fit":
-                return other, (STRONGER_ABOVE,)
+                return other, (" ".join(STRONGER_ABOVE.split()),)
         return left, ()
 
     def _shared(self) -> tuple[WithSky, Columns]:

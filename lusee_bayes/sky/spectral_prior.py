@@ -173,8 +173,7 @@ class SpectralPrior(checks.Described, eqx.Module):
         left_over = np.sqrt(free) * (skies - mixing @ maps)
         of, share = (left_over, 1.0) if residual is None else (skies, residual)
         spectra = None if share == 0 else jnp.asarray(share**2 * power_spectrum(of))
-        parts = map(jnp.asarray, (frequencies, mixing, power_spectrum(maps)))
-        return cls(*parts, spectra, names)
+        return cls(*map(jnp.asarray, (frequencies, mixing, power_spectrum(maps))), spectra, names)
 
     def description(self) -> tuple[str, ...]:
         residual = "no residual" if self.residual is None else "a residual in each"

@@ -21,17 +21,10 @@ from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.coupling import BeamModes, CouplingMatrix, Instrument
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import instrument_errors
+from lusee_bayes.systematics import systematic as kinds
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.horizon import Horizon
 from lusee_bayes.systematics.sources import source_responses
-from lusee_bayes.systematics.systematic import (
-    ChangedBeams,
-    Systematic,
-    Truth,
-    Unknown,
-    Values,
-    with_added,
-)
 
 
 class BeamErrorSection(Section):
@@ -64,7 +57,7 @@ class BeamErrorSection(Section):
     )
 
 
-class BeamErrors(Systematic):
+class BeamErrors(kinds.Systematic):
     """Errors of the beams, of either kind."""
 
     key, section, words, draw = "noise.beam", BeamErrorSection, "the beams", 3
@@ -93,13 +86,13 @@ class BeamErrors(Systematic):
         unknowns = []
         for name, std in section.parameters.items():
             p = setup.instrument.source.parameter(name)
-            unknown = Unknown(name, float(p.value), std, low=float(p.low), high=float(p.high))
+            unknown = kinds.Unknown(name, float(p.value), std, low=float(p.low), high=float(p.high))
             unknown.prior()
             unknowns.append(unknown)
         return InstrumentParameters(tuple(unknowns), setup.instrument)
 
     @classmethod
-    def truth(cls, section: BeamErrorSection, setup: Setup, key: PRNGKeyArray) -> Truth:
+    def truth(cls, section: BeamErrorSection, setup: Setup, key: PRNGKeyArray) -> kinds.Truth:
         if not section.parameters:
             return {"beam_amplitude": 1.0}
         unknowns = cls.build(section, setup, Around()).unknowns
@@ -107,7 +100,7 @@ class BeamErrors(Systematic):
         return {u.name: float(u.prior().sample(k)) for u, k in zip(unknowns, keys, strict=True)}
 
     @classmethod
-    def moved(cls, section: BeamErrorSection, setup: Setup, values: Values) -> Setup:
+    def moved(cls, section: BeamErrorSection, setup: Setup, values: kinds.Values) -> Setup:
         """Use the true beams, their ground emission, and their responses to sources."""
         if not {"beam_amplitude", *section.parameters} & set(values):
             return setup
@@ -125,7 +118,9 @@ class BeamErrors(Systematic):
         )
 
 
-def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[BeamSource, float]:
+def _true(
+    section: BeamErrorSection, setup: Setup, values: kinds.Values
+) -> tuple[BeamSource, float]:
     """The antennas with these values, and the frequency at which they are used."""
     source, frequency_mhz = setup.beam_source, setup.frequency_mhz
     if section.shift_mhz is not None:
@@ -137,7 +132,7 @@ def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[Beam
     return source.with_values({name: values[name] for name in section.parameters}), frequency_mhz
 
 
-def difference_of_beams(section: BeamErrorSection, setup: Setup, values: Values) -> BeamModes:
+def difference_of_beams(section: BeamErrorSection, setup: Setup, values: kinds.Values) -> BeamModes:
     """Difference to the beams of a shift or a file; one for each run if there is a horizon.
 
     Parameters
@@ -169,7 +164,7 @@ class BeamError(BeamErrors):
         dA for an amplitude of one, such as that of the difference to another beam.
     """
 
-    unknowns: ClassVar[tuple[Unknown, ...]] = (Unknown("beam_amplitude"),)
+    unknowns: ClassVar[tuple[kinds.Unknown, ...]] = (kinds.Unknown("beam_amplitude"),)
     first_order = False
 
     direction: CouplingMatrix
@@ -188,7 +183,7 @@ class BeamError(BeamErrors):
         return replace(model, noise=model.noise + noise)
 
 
-class InstrumentParameters(ChangedBeams, BeamErrors):
+class InstrumentParameters(kinds.ChangedBeams, BeamErrors):
     """Unknown parameters of the antennas, with Gaussian priors.
 
     Attributes
@@ -200,7 +195,7 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         The instrument with the prior means of its parameters.
     """
 
-    unknowns: tuple[Unknown, ...] = eqx.field(static=True)
+    unknowns: tuple[kinds.Unknown, ...] = eqx.field(static=True)
     instrument: Instrument
 
     def modes(self, modes, values):
@@ -210,7 +205,7 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
 
     def effect(self, model, values):
         """Use A of these beams, and the emission of ground and antennas with them."""
-        return with_added(super().effect(model, values), self.emitted(values))
+        return kinds.with_added(super().effect(model, values), self.emitted(values))
 
     def linearised(self, model, centre):
         """Differentiate :meth:`effect`."""
@@ -218,7 +213,7 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         emitted = np.stack(list(self.differences(self.emitted, centre)), axis=1)
         return lambda sky: of_sky(sky) + emitted
 
-    def emitted(self, values: Values) -> DataVector:
+    def emitted(self, values: kinds.Values) -> DataVector:
         """Emission of ground and antennas beyond the background, in K."""
         source, frequency_mhz = self.instrument.source, self.instrument.frequency_mhz
         more = source.with_values(values).background(frequency_mhz)

@@ -216,8 +216,7 @@ class FieldErrors(ChangedBeams):
             In prior standard deviations.
         """
         least, now = self.expectation.std, self.size * self.expectation.std
-        std = float(now * np.sqrt(np.mean(mean**2 + variance)))
-        return {STD: min(max(std, least), LARGEST)}
+        return {STD: min(max(float(now * np.sqrt(np.mean(mean**2 + variance))), least), LARGEST)}
 
 
 def of_ell(std: float, slope: float, lmax: int) -> Float[np.ndarray, " ells"]:

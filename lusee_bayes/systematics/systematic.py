@@ -206,19 +206,11 @@ class Systematic(eqx.Module):
     """
 
     unknowns: ClassVar[tuple[Unknown, ...]] = ()
-    key: ClassVar[str] = ""
     section: ClassVar[type[Section]]
-    words: ClassVar[str] = "a systematic"
-    unit: ClassVar[str] = ""
     draw: ClassVar[int | None] = None
-    needs_sky: ClassVar[bool] = False
-    changes_coupling: ClassVar[bool] = True
-    first_order: ClassVar[bool] = True
-    moves: ClassVar[bool] = False
-    moves_setup: ClassVar[bool] = False
-    scales_sky: ClassVar[bool] = False
-    has_table: ClassVar[bool] = False
-    learns: ClassVar[bool] = False
+    key, words, unit = "", "a systematic", ""
+    changes_coupling, first_order = True, True
+    needs_sky, moves, moves_setup, scales_sky, has_table, learns = (False,) * 6
 
     # --- in a scenario ---
 
@@ -501,8 +493,7 @@ class Marginalised(eqx.Module):
 
     systematic: Systematic | Marginalised
 
-    names: ClassVar[tuple[str, ...]] = ()
-    needs_sky: ClassVar[bool] = False
+    names, needs_sky = (), False
 
     @property
     def changes_coupling(self) -> bool:
@@ -627,8 +618,7 @@ class AdditiveNoise(Systematic):
         The data that the covariance is over.
     """
 
-    changes_coupling: ClassVar[bool] = False
-    first_order: ClassVar[bool] = False
+    changes_coupling, first_order = False, False
 
     name: str = eqx.field(static=True)
     layout: DataLayout
@@ -681,8 +671,7 @@ class Temperatures(Systematic):
         Contribution of each kelvin to the data.
     """
 
-    unit: ClassVar[str] = "K"
-    changes_coupling: ClassVar[bool] = False
+    unit, changes_coupling = "K", False
 
     unknowns: tuple[Unknown, ...] = eqx.field()
     per_kelvin: Float[Array, "data n"]
@@ -696,8 +685,7 @@ class Temperatures(Systematic):
 class Scale(Systematic):
     """A systematic without a Gaussian term: marginalised, it stays at its median."""
 
-    changes_coupling: ClassVar[bool] = False
-    first_order: ClassVar[bool] = False
+    changes_coupling, first_order = False, False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Return the model unchanged."""

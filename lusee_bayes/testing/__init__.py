@@ -288,6 +288,7 @@ def check_coupling(coupling: Coupling, dense: Float[np.ndarray, "data unknowns"]
     assert coupling.response is None
     same(coupling.dense(), dense)
     same(coupling @ m, dense @ sky)
+    same(coupling @ jnp.stack([m, -m], axis=1), np.stack([dense @ sky, -dense @ sky], axis=1))
     same(coupling.transpose_mv(d), dense.T @ data)
     assert np.isnan(coupling @ m.at[0].set(jnp.nan)).any()
     skies, responses = rng.standard_normal((3, n_unknowns)), rng.uniform(0.5, 2.0, (2, n_data))

@@ -291,8 +291,7 @@ def of_other_antennas(wrong, mhz=25.0):
 @pytest.mark.parametrize("wrong", [NOTHING, *(w for w in wrong_data.WRONG if w.name in PLAIN)])
 def test_a_mistake_is_told_from_unknown_antennas(wrong):
     data, scenario = of_other_antennas(wrong)
-    setup = set_up(scenario, data)
-    assert diagnosis.is_mistaken(setup, Around(data)) == (wrong is not NOTHING)
+    assert diagnosis.is_mistaken(set_up(scenario, data), Around(data)) == (wrong is not NOTHING)
 
 
 @pytest.mark.parametrize(

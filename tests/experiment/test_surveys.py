@@ -87,8 +87,7 @@ def test_a_survey_with_more_contrast_has_the_scale_of_the_best_line(tmp_path, da
     """As at another frequency: it departs from the sky smoothly and by no small error."""
     path, pixels = tmp_path / "steep.fits", modes_to_map(sky_of(2).modes, 2 * NSIDE)
     steep = map_to_modes(pixels.mean() * np.abs(pixels / pixels.mean()) ** 1.1, TOP)
-    given = survey_of(lb.Sky(steep, 25.0, "steep"), path)
-    row = mapped(data, given)[1].learned.survey_rows[0]
+    row = mapped(data, survey_of(lb.Sky(steep, 25.0, "steep"), path))[1].learned.survey_rows[0]
     smooth = healpy.smoothing(modes_to_map(sky_of(2).modes, NSIDE), np.radians(BEAM))
     scale = np.polyfit(smooth, healpy.read_map(path, dtype=float), 1)[0]
     assert row["std"] < 0.02 and abs(row["value"] - scale) < 2.5 * row["std"]

@@ -158,8 +158,7 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
 
     The exact grid's nodes are between the file's directions, where splines are good to 5e-6.
     """
-    beam = read_beam(write(tmp_path / "beam.fits"))
-    angles = (0.0, 33.0)
+    beam, angles = read_beam(write(tmp_path / "beam.fits")), (0.0, 33.0)
     theta, phi, solid_angle = hemisphere(40, 90)
     harmonics, crossed = real_harmonics(theta, phi, 4) * solid_angle[:, None], {}
     for f in (20.0, 30.0):

@@ -79,8 +79,7 @@ SCALES = [("UTC", 0.0), ("tai", 37.0), ("TT", 69.184), ("tdb", 69.184)]
 
 @pytest.mark.parametrize(("scale", "s"), SCALES)
 def test_times_in_other_scales_are_brought_to_utc(data, tmp_path, scale, s):
-    path = tmp_path / "other.nc"
-    said = {"jd1": {"scale": scale}, "jd2": {"scale": scale}}
+    path, said = tmp_path / "other.nc", {"jd1": {"scale": scale}, "jd2": {"scale": scale}}
     altered(lambda d: [d[k].attrs.update(said[k]) for k in said] and d.drop_vars("time"))(
         data, path
     )

@@ -152,8 +152,7 @@ def test_a_quiet_group_is_named_although_the_whole_fits():
 
 
 def test_weights_that_rounding_makes_indefinite_have_no_roots():
-    weights = np.array([np.eye(2), [[1.0, 2.0], [2.0, 1.0]]])
-    found = roots(weights, np.ones((2, 2), dtype=bool))
+    found = roots(np.array([np.eye(2), [[1.0, 2.0], [2.0, 1.0]]]), np.ones((2, 2), dtype=bool))
     np.testing.assert_array_equal(found[0], np.eye(2))
     assert np.isnan(found[1]).all()
 
@@ -575,8 +574,7 @@ def test_groups_have_data():
 def test_what_rounding_hides_is_not_blamed(factor, blamed, monkeypatch):
     """chi^2 of a group exceeds that of all data only by rounding: the others would seem to fit."""
     model, data = simulated()
-    data = replace(data, data=100.0 * np.asarray(data.data))
-    whole = judged(model, data).split.instrument.chi2
+    whole = judged(model, replace(data, data=100.0 * np.asarray(data.data))).split.instrument.chi2
 
     def each(self, groups):
         return [left_out.Missed(n := int(np.sum(g)), factor * whole, float(n)) for g in groups]

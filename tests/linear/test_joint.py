@@ -39,8 +39,7 @@ PRIORS = {
 def covariance_of(prior):
     """S of all channels' skies, channel by channel, from the definition."""
     n, components = len(FREQUENCIES) * N_MODES, np.asarray(prior.spectra)
-    ell = np.repeat(np.arange(LMAX + 1), 2 * np.arange(LMAX + 1) + 1)
-    s = np.zeros((n, n))
+    ell, s = np.repeat(np.arange(LMAX + 1), 2 * np.arange(LMAX + 1) + 1), np.zeros((n, n))
     for column, spectrum in zip(np.asarray(prior.mixing).T, components, strict=True):
         s += np.kron(np.outer(column, column), np.diag(spectrum[ell]))
     if prior.residual is not None:

@@ -52,8 +52,7 @@ def test_directions_in_the_galaxy():
 
 
 def test_a_uniform_sky_through_a_cosine_beam():
-    grid = ref.hemisphere(8, 16)
-    sky = np.array([5.0 * np.sqrt(4 * np.pi), 0.0, 0.0, 0.0])
+    grid, sky = ref.hemisphere(8, 16), np.array([5.0 * np.sqrt(4 * np.pi), 0.0, 0.0, 0.0])
     got = ref.visibilities(np.cos(grid[0])[None] / np.pi, grid, sky, WHEN, **SITE)
     np.testing.assert_allclose(got, [5.0], rtol=1e-13)
 

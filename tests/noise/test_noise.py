@@ -20,8 +20,7 @@ BANDWIDTH, STEP = 2.0e5, 600.0
 
 def temperatures(seed=0) -> np.ndarray:
     """T(t), Hermitian and positive definite, shape (times, antennas, antennas), in K."""
-    rng = np.random.default_rng(seed)
-    shape = (N_TIMES, N_ANTENNAS, 6)
+    rng, shape = np.random.default_rng(seed), (N_TIMES, N_ANTENNAS, 6)
     x = rng.normal(size=shape) + 1j * rng.normal(size=shape)
     return 1e3 * x @ x.conj().swapaxes(1, 2)
 
@@ -150,8 +149,7 @@ ABSENT = [*product((WHOLE_TIME, LOST_PORT), ("paper", "exact")), (ONE_CROSS, "pa
 @pytest.mark.parametrize("absent", [0.0, np.nan])
 @pytest.mark.parametrize(("flags", "form"), ABSENT)
 def test_absent_samples_change_nothing_for_the_others(flags, form, absent):
-    layout = DataLayout.from_flags(flags)
-    seen = np.where(flags, absent, np.asarray(VISIBILITIES))
+    layout, seen = DataLayout.from_flags(flags), np.where(flags, absent, np.asarray(VISIBILITIES))
     options = {"bandwidth_hz": BANDWIDTH, "step_s": STEP, "form": form}
     got = lb.radiometer_noise(seen, layout, **options)
     keep = np.flatnonzero(~flags.ravel())

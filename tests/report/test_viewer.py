@@ -155,8 +155,7 @@ def correlated(tmp_path_factory):
 
 @needs_node
 def test_channels_of_the_page_are_those_of_the_files(small_cube, tmp_path):
-    page = (small_cube.folder / "report.html").read_text()
-    rng = np.random.default_rng(3)
+    page, rng = (small_cube.folder / "report.html").read_text(), np.random.default_rng(3)
     lon, lat = rng.uniform(0, 360, 40), np.degrees(np.arcsin(rng.uniform(-1, 1, 40)))
     points = json.dumps(np.stack([lon, lat], 1).tolist())
     told = run_page(page, tmp_path, f"const points = {points};" + PARTS["channels"])

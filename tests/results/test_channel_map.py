@@ -15,6 +15,8 @@ from scipy import stats
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.experiment import rounds
+from lusee_bayes.experiment.model import set_up, simulate
 from lusee_bayes.judge.chi2 import stands_out
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.posterior import pixel_std
@@ -159,6 +161,18 @@ def test_every_channel_is_judged_if_that_is_asked_for(bad, tmp_path, numbers_alo
     np.testing.assert_array_equal(posterior_of(tmp_path / "run")["mean"], result.stacked("mean"))
 
 
+def test_a_sky_above_lmax_that_no_one_expected_blames_no_data(monkeypatch):
+    given = "noise.above_lmax={margin: 8, least_lmax: 0}", "observation.step_s=14400"
+    scenario = lb.load_scenario("fiducial", ["lmax=6", *given])
+    setup = set_up(scenario)
+    brighter = replace(setup.above, modes=10.0 * setup.above.modes)
+    data = replace(simulate(replace(setup, above=brighter)), truth=None)
+    found = mapped(experiment := lb.build(scenario, data))[1]
+    assert found.judged.level != "does not fit" and "above lmax is not as" in found.doubts[0]
+    monkeypatch.setattr(rounds, "model_of_whole_sky", lambda *_: None)
+    assert mapped(experiment)[1].judged.level == "does not fit"
+
+
 def test_modes_that_the_prior_knows_exactly_can_have_earlier_data():
     """A C_ell of zero: the prior that earlier data leave has a density anyway."""
     experiment = small_experiment()
@@ -253,8 +267,7 @@ def test_its_resolution_is_packed(dense):
     details = channel.details
     width = details.prior_width
     ell, _ = mode_numbers(LMAX)
-    steps = details.resolution_step[np.ix_(ell, ell)]
-    scale = width[:, None] / width[None]
+    steps, scale = details.resolution_step[np.ix_(ell, ell)], width[:, None] / width[None]
     found = details.resolution * steps * scale
     s = np.asarray(made.from_data.model.prior.covariance())
     exact = np.eye(len(s)) - np.asarray(made.from_all.posterior.covariance()) @ np.linalg.inv(s)

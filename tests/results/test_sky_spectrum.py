@@ -49,8 +49,7 @@ def test_index_and_turnover_are_those_of_a_parabola():
         within(found.maps[f"{name}_std"][:2] / std[k], 1.0, 5.0 / np.sqrt(8000.0))
         within(found.maps[name][:2], cells[k, :2], 5.0 * std[k] / np.sqrt(4000.0))
     # the first has none in the band; d ln T / dx = 0 at x = -b / 2 c
-    turnover = 10.0 * np.exp(-1.0 / 3.0)
-    gradient = np.array([0.0, 1.0, -2.0 / 3.0]) / 3.0
+    turnover, gradient = 10.0 * np.exp(-1.0 / 3.0), np.array([0.0, 1.0, -2.0 / 3.0]) / 3.0
     expected = turnover * np.sqrt(gradient @ np.linalg.inv(weighted.T @ weighted) @ gradient)
     assert found.maps["turnover"][1] == pytest.approx(turnover, abs=0.1 * expected)
     assert found.maps["turnover_std"][1] == pytest.approx(expected, rel=0.06)

@@ -282,8 +282,7 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns(
     expected = white_posterior(a, stds, noise, rest)
     experiments = [lb.build(channel) for channel in scenario.channels()]
     tables = [unknowns_report(e, lb.infer(e)).table for e in experiments]
-    alone = pd.concat(tables, ignore_index=True)
-    table = channels.table("unknowns", "table")
+    alone, table = pd.concat(tables, ignore_index=True), channels.table("unknowns", "table")
     scale, own = table["prior_std"].to_numpy(), unmixed[4 * N_MODES :]
     mean, std = own @ expected.mean, np.sqrt(np.diagonal(own @ expected.covariance @ own.T))
     assert np.abs(((table["value"] - table["prior"]) / scale - mean) / std).max() < 1e-4

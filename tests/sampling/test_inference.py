@@ -341,8 +341,7 @@ DEVICES_SCRIPT = """
     import test_inference as t
 
     assert len(jax.devices()) == 2
-    out = Path(sys.argv[1])
-    gaussian = t.small_model()
+    out, gaussian = Path(sys.argv[1]), t.small_model()
     data = gaussian.sample(jax.random.key(5))[1]
     whitening = t.lb.Whitening.of(gaussian.condition(data).posterior)
 

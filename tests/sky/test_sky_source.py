@@ -250,8 +250,7 @@ def test_fifty_maps_and_what_is_between_them(tmp_path, maps):
 def test_a_scenario_with_a_cube(tmp_path, maps):
     path = write_cube(tmp_path / "cube.fits", maps)
     scenario = lb.load_scenario("fiducial", ["lmax=4", f"sky.file={path}"])
-    sky = scenario.sky.at(scenario.frequency_mhz, scenario.lmax)
-    one = tmp_path / "one.fits"
+    sky, one = scenario.sky.at(scenario.frequency_mhz, scenario.lmax), tmp_path / "one.fits"
     healpy.write_map(one, maps[24], dtype=np.float64, column_units="K", coord="G")
     np.testing.assert_array_equal(sky.modes, lb.sky_from_file(one, 25.0, 4).modes)
     assert "50 HEALPix sky maps, NSIDE 8" in describe(path) and "1 to 50 MHz" in describe(path)

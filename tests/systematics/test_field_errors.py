@@ -184,8 +184,7 @@ def test_a_report_has_the_share_of_the_variance_that_they_add(tmp_path):
 @pytest.mark.long
 def test_samples_of_measured_data_have_them_too(tmp_path):
     given = lb.load_scenario("fiducial", ["lmax=2", "beam.exact=false", "observation.step_s=2e5"])
-    data = simulate(set_up(given))
-    sampler = lb.Sampler(chains=1, warmup=20, draws=4)
+    data, sampler = simulate(set_up(given)), lb.Sampler(chains=1, warmup=20, draws=4)
     lb.run_sample(given, tmp_path / "run", data=data, sampler=sampler)
     found, expected = lb.load_scenario(tmp_path / "run" / "scenario.yaml"), given.of_measured()
     assert found.noise.beam == expected.noise.beam is not None

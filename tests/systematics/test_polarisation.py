@@ -64,8 +64,7 @@ def basis(n):
 def seen_by_pixels(setup, q, u):
     """Visibilities of Galactic maps of Q and U, a sum over pixels above the horizon."""
     n = np.array(healpy.pix2vec(healpy.get_nside(q), np.arange(len(q)))).T
-    axes = np.array([setup.observation.antenna_directions(x) for x in np.eye(3)])
-    seen = []
+    axes, seen = np.array([setup.observation.antenna_directions(x) for x in np.eye(3)]), []
     for turn in np.moveaxis(axes, 0, 2):  # from Galactic vectors to those of the antennas
         here = n @ turn.T
         here /= np.linalg.norm(here, axis=1, keepdims=True)

@@ -169,8 +169,7 @@ def cardinal_functions(theta: Angles, intervals: int, parity: int) -> np.ndarray
         of_wave[[0, -1]] /= 2.0
         return np.cos(waves) @ of_wave
     # odd functions are zero at the poles
-    of_wave = np.pad(dst(np.eye(intervals - 1), type=1, axis=0) / intervals, 1)
-    return np.sin(waves) @ of_wave
+    return np.sin(waves) @ np.pad(dst(np.eye(intervals - 1), type=1, axis=0) / intervals, 1)
 
 
 VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]
