@@ -24,7 +24,7 @@ that is not zero everywhere.
 
 **Turntable.** Terrain does not turn with the antennas. In their frame it differs from run to run:
 with a horizon, beams are (runs, products, modes). The model neglects that terrain does not tilt
-with the lander, and that point sources set behind it.
+with the lander, and that it hides point sources and the polarised sky.
 """
 
 from __future__ import annotations

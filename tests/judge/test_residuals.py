@@ -574,7 +574,8 @@ def test_groups_have_data():
 def test_what_rounding_hides_is_not_blamed(factor, blamed, monkeypatch):
     """chi^2 of a group exceeds that of all data only by rounding: the others would seem to fit."""
     model, data = simulated()
-    whole = judged(model, replace(data, data=100.0 * np.asarray(data.data))).split.instrument.chi2
+    data = replace(data, data=100.0 * np.asarray(data.data))
+    whole = judged(model, data).split.instrument.chi2
 
     def each(self, groups):
         return [left_out.Missed(n := int(np.sum(g)), factor * whole, float(n)) for g in groups]
