@@ -281,13 +281,18 @@ class Conditioned:
                 instrument = Split.of(*given, None if joint else self.expected).instrument
                 instrument = instrument.allowing(unused)
             if alone or thorough or instrument.p < DOUBTFUL:
-                left, stronger = self._residuals(unused)
+                left = residuals(judge, data, unused, learned=learned is not None)
                 instrument = left.split.instrument
             found["details"] = _details(self) if alone else None
         bad = left is not None and left.level() == "does not fit"
         if bad or thorough:
             with stages("usual mistakes"):
-                found["diagnosis"] = diagnose(experiment.setup, inference, left)
+                named = found["diagnosis"] = diagnose(experiment.setup, inference, left)
+                # no mistake: a prior above lmax that is wrong blames no data
+                blameless = bad and (not named.proposals or named.is_truncation)
+                if blameless and (other := self._under_any_sky_above(left, unused)):
+                    left, instrument = other, other.split.instrument
+                    stronger = (" ".join(STRONGER_ABOVE.split()),)
         if left is not None:
             truncated = "diagnosis" in found and found["diagnosis"].is_truncation
             found["judged"] = self._judged(left, truncated=truncated)
@@ -328,21 +333,18 @@ class Conditioned:
             **found,
         )
 
-    def _residuals(self, unused: float) -> tuple[Residuals, tuple[str, ...]]:
-        """The data against the model, and a doubt if only another sky above lmax makes them fit."""
-        data, learned = self.experiment.data, self.experiment.learned is not None
-        left, model = residuals(self.judged.solution, data, unused, learned=learned), None
-        if left.level() == "does not fit":
-            model = rounds.model_of_whole_sky(self.experiment.setup, self.from_data)
-        if model is None:
-            return left, ()
+    def _under_any_sky_above(self, left: Residuals, unused: float) -> Residuals | None:
+        """The residuals if any sky above lmax is allowed; None if the data do not fit even then."""
+        data = self.experiment.data
+        model = rounds.model_of_whole_sky(self.experiment.setup, self.from_data)
         # data that do not fit may need a sky for which float64 has too few digits
         with suppress(InputError):
-            other = residuals(model.condition(data.data), data, unused, learned=learned)
-            other = replace(other, split=replace(other.split, prior=left.split.prior))
-            if other.level() != "does not fit":
-                return other, (" ".join(STRONGER_ABOVE.split()),)
-        return left, ()
+            if model is not None:
+                solution = model.condition(data.data)
+                other = residuals(solution, data, unused, learned=left.learned)
+                other = replace(other, split=replace(other.split, prior=left.split.prior))
+                return None if other.level() == "does not fit" else other
+        return None
 
     def _shared(self) -> tuple[WithSky, Columns]:
         """Covariance and w of :class:`.Departure`, in K^2 and K."""
