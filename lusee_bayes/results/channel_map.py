@@ -340,8 +340,7 @@ class Conditioned:
         # data that do not fit may need a sky for which float64 has too few digits
         with suppress(InputError):
             if model is not None:
-                solution = model.condition(data.data)
-                other = residuals(solution, data, unused, learned=left.learned)
+                other = residuals(model.condition(data.data), data, unused, learned=left.learned)
                 other = replace(other, split=replace(other.split, prior=left.split.prior))
                 return None if other.level() == "does not fit" else other
         return None
