@@ -27,6 +27,7 @@ from lusee_bayes.experiment.diagnosis import is_mistaken
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.second_order import with_second_order
 from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
@@ -232,7 +233,7 @@ def rounds_of(experiment: Experiment, stages: Stages, name: str) -> AbstractCont
 
 
 def infer(experiment: Experiment, report: rounds.Report | None = None) -> rounds.Inference:
-    """Condition the experiment's model on its data (:func:`.settled`).
+    """Condition the experiment's model on its data (:func:`.settled`, :func:`.with_second_order`).
 
     Parameters
     ----------
@@ -246,7 +247,8 @@ def infer(experiment: Experiment, report: rounds.Report | None = None) -> rounds
         As in :func:`.settled`.
     """
     start = Around(experiment.data)
-    return experiment.inference or rounds.settled(experiment.setup, start, report=report)
+    found = experiment.inference or rounds.settled(experiment.setup, start, report=report)
+    return with_second_order(experiment.setup, found)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
@@ -373,6 +375,13 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
             f"The data require field errors of {percent:.2g} %, {size:.2g} times noise.fields.std. "
             "Mistakes look alike: the usual ones were tried."
         )
+    for part in inference.moving:
+        wider = 1.001 * part.centre
+        for k in np.flatnonzero(wider != part.systematic.inside(wider)):
+            notes.append(
+                f"{part.systematic.names[k]} is held at the end of its range, but data are more "
+                "probable beyond it: the errors of the map may not hold. Mistakes can look alike."
+            )
     if setup.scenario.noise.radiometer.form == "exact":
         seen = noise_visibilities(setup, inference.around, radiometer_about(setup))
         if not (known := np.asarray(of_voltages(seen))).all():

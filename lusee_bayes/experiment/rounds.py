@@ -201,7 +201,7 @@ class Inference:
     def under(self, prior: Prior, learned: Learned | None = None) -> Inference:
         """The inference under another prior, with how it was learned."""
         solution = self.solution.under(prior)
-        return replace(self, solution=_less_moved(solution, self.systematics), learned=learned)
+        return replace(self, solution=less_moved(solution, self.systematics), learned=learned)
 
 
 # learns a prior from an inference, starting at given parameters
@@ -362,6 +362,7 @@ def _elsewhere(setup: Setup, inference: Inference, way: int) -> Around:
         for part in parts:
             drawn = rng.standard_normal(len(part.centre))
             z = np.where(rng.random(len(drawn)) < KEPT[way % len(KEPT)], part.centre, drawn)
+            z = part.systematic.inside(z)
             values |= part.systematic.in_units(z)
             log_prior -= 0.5 * float(z @ z)
         exact = _exact(setup, Around(inference.around.data, values=values))
@@ -378,10 +379,10 @@ def _conditioned(setup: Setup, around: Around, rounds: int, exact: Inference | N
         solution = model.condition(around.data.data)
     else:
         solution = FromInformation.beside(exact.solution, model).condition(around.data.data)
-    return Inference(_less_moved(solution, held), held, rounds, around)
+    return Inference(less_moved(solution, held), held, rounds, around)
 
 
-def _less_moved(solution: Solution, held: Sequence[Marginalised]) -> Solution:
+def less_moved(solution: Solution, held: Sequence[Marginalised]) -> Solution:
     """Correct chi^2 and evidence for the moved prior means of unknowns."""
     solved, excess = solution.weighted_residual(), 0.0
     for part in held:
@@ -423,7 +424,8 @@ def _around(
     around, solution = inference.around, inference.solution
     solved = solution.weighted_residual()
     if inference.moving:
-        ways = [(s, s.expected + s.columns.T @ solved - s.centre) for s in inference.expanded]
+        ends = [(s, s.expected + s.columns.T @ solved) for s in inference.expanded]
+        ways = [(s, s.systematic.inside(end) - s.centre) for s, end in ends]
         # learned prior widths indicate least how far the first order is valid
         moving = [(s.systematic.learns, way) for s, way in ways if s.systematic.moves]
         far = [way for learns, way in moving if not learns] or [way for _, way in moving]

@@ -1,14 +1,7 @@
 """Validity of a map: limits of its Gaussian approximation, and errors that it would not reveal.
 
-**Reach.** A Gaussian around the inferred values describes the unknowns of the instrument. Draws of
-sky and unknowns from it get weights w, the ratio of the exact density to it, ::
-
-    ln w = -1/2 [ |L^-1 (d - v(m, z))|^2 - |L^-1 (d - v_lin(m, z))|^2 ] - z^2 / 2 + (z - e)^2 / 2,
-
-with L for the noise without the unknowns, and e the moved means of the model's prior. The tail of
-the weights shows whether the Gaussian covers the posterior (Pareto k of Vehtari et al. 2024: up to
-0.7). With hundreds of unknowns it rarely does: many small second orders add up in w, but not in
-the map. Their effect on the mean map, C A^T N^-1 (v - v_lin), shows whether its errors are valid.
+**Reach.** A Gaussian around the inferred values describes the unknowns of the instrument; draws
+from it show whether it, and the map's errors, are valid (:mod:`.second_order`).
 
 **Blind spots.** An instrument error that no unknown describes adds T z to the data. It moves the
 mean map by C A^T N^-1 T z. It raises the residual chi^2, the part that no sky can absorb, by ::
@@ -23,20 +16,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Modes
-from lusee_bayes.core.engine import in_threads
-from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import base_model, moved, systematics
+from lusee_bayes.experiment.model import base_model, moved
 from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.second_order import LARGEST_K, LARGEST_MOVE, SecondOrder, weighed
 from lusee_bayes.experiment.unknowns import tested_offsets
-from lusee_bayes.linear.amplitudes import AmplitudesOfSky
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.systematics.beam import InstrumentParameters
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.field_errors import FieldErrors, FieldErrorsSection
@@ -44,12 +33,6 @@ from lusee_bayes.systematics.horizon import Horizon, HorizonSection
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
 from lusee_bayes.systematics.systematic import Systematic, Unknown
 
-# number of draws to weight, in total and first, and the largest k for a valid Gaussian
-N_WEIGHED, N_FIRST, LARGEST_K = 100, 25, 0.7
-# if log-weights scatter by less (rms), the effective sample is 1 / (1 + EVEN^2) = 0.92 of the draws
-EVEN = 0.3
-# a move of the map (rms, in standard deviations) that enlarges its error by a twentieth
-LARGEST_MOVE = 0.3
 # relative errors of the fields and of each parameter of the antennas, and an error of the clock
 FIELDS, PARAMETERS, CLOCK_S = 1e-3, 1e-2, 600.0
 # unknown terrain on one side, whose effect grows as the cube of its altitude
@@ -69,68 +52,6 @@ MOST_NAMED = 4
 Columns = Float[np.ndarray, "data columns"]
 Errors = tuple[dict[str, float], str, int, Columns]
 Reach = tuple[list[str], list[str]]
-
-
-def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float, float] | None:
-    """Weight draws of sky and unknowns from the Gaussian of an inference.
-
-    Parameters
-    ----------
-    setup : Setup
-    data : (data,) array
-        In K.
-    inference : Inference
-
-    Returns
-    -------
-    (float, float) or None
-        Pareto k of the weights, -inf if these are nearly equal, and the rms move of the map by
-        terms beyond first order, in standard deviations; None if no values were found in rounds.
-    """
-    parts, factor = inference.expanded, inference.solution.factor
-    if not inference.moving or not isinstance(factor, LowRankFactor):
-        return None
-    columns = np.concatenate([part.columns for part in parts], axis=1)
-    amplitudes = AmplitudesOfSky.of(inference.solution, columns)
-    keys = jax.random.split(jax.random.key(setup.scenario.seed), 2)
-    skies = np.asarray(inference.posterior.sample(keys[0], N_WEIGHED))
-    values, axes = np.linalg.eigh(amplitudes.covariance)
-    spread = axes * np.sqrt(np.maximum(values, 0.0))
-    normals = np.asarray(jax.random.normal(keys[1], (N_WEIGHED, len(amplitudes.mean))))
-    off = amplitudes.mean + normals @ spread.T - (skies - amplitudes.reference) @ amplitudes.pull.T
-    expected = np.concatenate([part.expected for part in parts])
-    ends = np.cumsum([len(part.centre) for part in parts])[:-1]
-    base = base_model(setup, inference.around)
-    built = [systematic for _, systematic in systematics(setup, inference.around)]
-    first_order, beyond = np.empty((2, len(data), N_WEIGHED))
-
-    def drawn(k: int) -> None:
-        sky, a, kinds = skies[k], off[k], (type(part.systematic) for part in parts)
-        z, model = dict(zip(kinds, np.split(a + expected, ends), strict=True)), base
-        for systematic in built:
-            if type(systematic) in z:
-                model = systematic.effect(model, systematic.values(z[type(systematic)]))
-            elif not systematic.first_order:
-                model = systematic.averaged(model)
-        first_order[:, k] = inference.model.predict(sky) + columns @ a
-        beyond[:, k] = model.predict(sky) - first_order[:, k]
-
-    root, begin = np.asarray(inference.posterior.root()), 0
-    for n in (N_FIRST, N_WEIGHED):
-        in_threads(drawn, range(begin, n))
-        begin, steps, linear, more = n, off[:n], first_order[:, :n], beyond[:, :n]
-        left = data[:, None] - linear
-        exact, linear = (np.asarray(factor.base.whiten(one)) for one in (left - more, left))
-        misfit = (linear**2).sum(0) - (exact**2).sum(0)
-        log_weights = 0.5 * (misfit + (steps**2).sum(1) - ((steps + expected) ** 2).sum(1))
-        pulls = np.asarray(inference.model.coupling.transpose_mv(np.asarray(factor.solve(more))))
-        moved_by = float(np.sqrt(np.mean((root.T @ pulls) ** 2)))
-        if log_weights.std() < EVEN:
-            return -np.inf, moved_by
-    weights = np.exp(log_weights - log_weights.max())
-    if weights.sum() ** 2 < 2.0 * (weights**2).sum():  # one draw has nearly all weight: no tail
-        return np.inf, moved_by
-    return float(arviz_stats.array_stats.psislw(-log_weights)[1]), moved_by
 
 
 @dataclass(frozen=True)
@@ -279,8 +200,10 @@ def reach(experiment: Experiment, inference: Inference, alone: bool = True) -> R
     doubts, notes, setup = [], [], experiment.setup
     k, moved_by = weighed(setup, np.asarray(experiment.data.data), inference) or (0.0, 0.0)
     wrong = moved_by >= LARGEST_MOVE
+    keys = ", ".join(dict.fromkeys(part.systematic.key for part in inference.moving))
+    if any(isinstance(part.systematic, SecondOrder) for part in inference.systematics):
+        notes.append(f"N contains the second order of {keys}: the first moves the map too far.")
     if wrong or (alone and k > LARGEST_K):
-        keys = ", ".join(dict.fromkeys(part.systematic.key for part in inference.moving))
         hold = "do not hold" if wrong else "hold"
         (doubts if wrong else notes).append(
             f"The posterior of {keys} is not quite Gaussian. The map's errors {hold}: terms beyond "

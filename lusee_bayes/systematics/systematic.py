@@ -326,15 +326,25 @@ class Systematic(eqx.Module):
         """Draw all of them from N(0, 1): in prior standard deviations from the prior mean."""
         return np.asarray(jax.random.normal(key, (len(self.names),)))
 
+    def _each(self, field: str) -> Vector:
+        """A field of :class:`Unknown` for every number."""
+        numbers = [np.full(u.size or 1, float(getattr(u, field))) for u in self.unknowns]
+        return np.concatenate(numbers)
+
     @property
     def means(self) -> Vector:
         """Prior means, in the units of the names."""
-        return np.concatenate([np.full(u.size or 1, float(u.mean)) for u in self.unknowns])
+        return self._each("mean")
 
     @property
     def stds(self) -> Vector:
         """Prior standard deviations."""
-        return np.concatenate([np.full(u.size or 1, float(u.std)) for u in self.unknowns])
+        return self._each("std")
+
+    def inside(self, z: Vector) -> Vector:
+        """The nearest numbers in the domains, with room for the steps of derivatives."""
+        low, high = ((self._each(end) - self.means) / self.stds for end in ("low", "high"))
+        return np.clip(z, low + STEP, high - STEP)
 
     def values(self, z: Float[Array, " n"]) -> dict[str, float | Float[Array, "..."]]:
         """Values by site, from numbers in prior standard deviations from the prior mean."""

@@ -161,6 +161,20 @@ def test_data_tell_parameters_between_files(tables, seed):
     assert error > 1.0 and "of surface_permittivity 3.7" in said[0]
 
 
+FAR = pytest.param(4.3, False, marks=pytest.mark.essential)
+
+
+@pytest.mark.parametrize(("high", "fits"), [(3.8, True), FAR])
+def test_a_parameter_beyond_the_files_makes_a_map_and_a_doubt(tables, high, fits):
+    """The value is held at 3.76, the end; a little beyond it the first order suffices."""
+    own = "noise.beam=null", f"beam.surface_permittivity={high}"
+    truth = set_up(lb.load_scenario(scenario(None, 0.06), own))
+    experiment = lb.build(scenario(tables[0.06], 0.06), data=simulate(truth))
+    inference = lb.infer(experiment)
+    assert inference.fits == fits == (rms_of_directions(inference, truth.sky.modes) < 1.3)
+    assert any("held at the end of its range" in text for text in doubts(experiment, inference))
+
+
 def test_what_cannot_be_is_refused(tables, tmp_path, capsys):
     table = tables[0.4]
     words = "surface_permittivity is 4.2, but the files cover 3.3 to 4.1; give a value in"
