@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import T
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.progress import Stages
@@ -187,8 +188,10 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
     files, timestamp = files_of(data), scenario.observation.timestamp
     path = files[0] if files else "the data"
     if not files or not _is_waterfall(path):
-        sets = [read_visibilities(path) for path in files] or items_of(data)
-        data = _stamped(path, _nearest(sets, scenario.frequency_mhz), timestamp)
+        data = _nearest(items_of(data), scenario.frequency_mhz)
+        if files:
+            path, data = data, read_visibilities(data)
+        data = _stamped(path, data, timestamp)
     else:
         waterfall = read_waterfall(path)
         data = waterfall.at(scenario.frequency_mhz, scenario.beam.source().n_ports)
@@ -216,16 +219,25 @@ def _is_waterfall(path: Path) -> bool:
     return is_waterfall
 
 
-def _nearest(sets: Sequence[Visibilities], frequency_mhz: float) -> Visibilities:
-    """The only set, or the set at a frequency. InputError if there is none, or several."""
-    near = [one for one in sets if abs(one.frequency_mhz - frequency_mhz) <= SAME_FREQUENCY_MHZ]
-    if len(sets) > 1 and len(near) != 1:
-        mhz = ", ".join(f"{data.frequency_mhz:.9g}" for data in sets)
+def _nearest(sets: Sequence[T], frequency_mhz: float) -> T:
+    """The only set or file, or that at a frequency. InputError if there is none, or several."""
+    if len(sets) == 1:
+        return sets[0]
+    each = [x.frequency_mhz if isinstance(x, Visibilities) else _frequency_of(x) for x in sets]
+    near = [k for k, mhz in enumerate(each) if abs(mhz - frequency_mhz) <= SAME_FREQUENCY_MHZ]
+    if len(near) != 1:
+        mhz = ", ".join(f"{mhz:.9g}" for mhz in each)
         raise InputError(
             f"the data are at {mhz} MHz, {len(near) or 'none'} of them at {frequency_mhz:.15g} "
             "MHz; give one set of each frequency, and add more with map --add"
         )
-    return sets[0] if len(sets) == 1 else near[0]
+    return sets[near[0]]
+
+
+def _frequency_of(path: Path) -> float:
+    """The frequency of a file of visibilities, in MHz; the rest of the file is not read."""
+    with opened_tree(path, formats.VISIBILITIES, "data", HINT) as tree:
+        return float(tree.attrs.get("frequency_mhz", np.nan))
 
 
 def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) -> Visibilities:

@@ -161,7 +161,9 @@ class ChannelFits:
                 "lmax that the model expects (noise.above_lmax)."
             ]
         if level == "does not fit":
-            return ["Map the flagged channels one by one: this also tests their products and days."]
+            others = "Without them, map the others again: their skies moved, too."
+            advice = "Map the flagged channels one by one: this also tests their products and days."
+            return [advice, *[others][: self.joint]]
         if level == "unlike the prior" and self.prior.too_small:
             narrower = "smaller spectral.residual" if self.joint else "narrower prior"
             finding = "The prior is wider than the skies require, and error bars are too wide"

@@ -79,12 +79,13 @@ def conditioned(
     """
     with rounds_of(experiment, stages or Stages(), "posterior") as report:
         new, data = infer(experiment, report), experiment.data
-        setup, kept = experiment.setup, None
+        setup, kept, times = experiment.setup, None, taken(data.observation)
+        digest = f"{data.digest()} {times['first']} {times['last']}"
         if earlier is not None or experiment.scenario.output.information:
             kept = rounds.of_whole_sky(setup, new)
         if earlier is None:
-            return Conditioned(experiment, new, new, new, (data.digest(),), kept)
-        kept = earlier.with_more(kept, data.digest())
+            return Conditioned(experiment, new, new, new, (digest,), kept)
+        kept = earlier.with_more(kept, digest)
         information, prior = rounds.of_map(setup, kept), new.model.prior
         posterior = information.posterior(prior)
         information = information.recentred(posterior.mean)
@@ -98,7 +99,7 @@ def conditioned(
         parts = {"posterior": posterior, "kept_information": information, "excess": 0.0}
         total = replace(new, solution=replace(new.solution, **parts))
         judged = replace(new, solution=judge)
-        return Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()), kept)
+        return Conditioned(experiment, new, total, judged, (*earlier.digests, digest), kept)
 
 
 def _given_earlier(posterior: Posterior) -> DensePrior:
@@ -246,6 +247,16 @@ class Conditioned:
             report = self.unknowns.report(alone.posterior.mean, alone.covariance)
             return replace(made, unknowns=replace(report, onto=True))
 
+    def overlap(self) -> tuple[str, ...]:
+        """A doubt if earlier data were taken during the same time."""
+        *earlier, (_, first, last) = (digest.split() for digest in self.digests)
+        same = [times for _, *times in earlier if times and times[0] <= last and first <= times[1]]
+        return tuple(
+            f"These data ({first} to {last}) overlap in time with earlier ones ({begin} to {end}): "
+            "samples in both count twice."
+            for begin, end in same[:1]
+        )
+
     def channel_data(
         self,
         stages: Stages | None = None,
@@ -326,7 +337,7 @@ class Conditioned:
             parameters=() if learned is None else tuple(learned.as_rows()),
             log_evidence_learned=None if learned is None else learned.log_evidence,
             beam_rms_difference=beam_rms_difference(experiment.setup),
-            doubts=(*doubts(experiment, inference), *stronger, *not_gaussian),
+            doubts=(*doubts(experiment, inference), *stronger, *not_gaussian, *self.overlap()),
             notes=(*notes, *harmless),
             digests=self.digests,
             information=self.kept if scenario.output.information else None,

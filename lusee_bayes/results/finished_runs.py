@@ -179,9 +179,10 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
 
 def _observed(channels: Sequence[ChannelResult], axis: dict) -> dict[str, xr.Dataset]:
     """The data and their times; NaN at times that a channel lacks."""
-    parts = []
-    for channel in channels:
-        coords = {"product": list(channel.labels), "time": ("time", channel.hours, HOURS)}
+    parts, first = [], [np.datetime64(channel.taken["first"]) for channel in channels]
+    for channel, begin in zip(channels, first, strict=True):
+        hours = channel.hours + (begin - min(first)) / np.timedelta64(1, "h")
+        coords = {"product": list(channel.labels), "time": ("time", np.round(hours, 6), HOURS)}
         grid = (("product", "time"), channel.data, {"units": "K"})
         angle = ("time", channel.turntable_deg, {"units": "degree"})
         parts.append(xr.Dataset({"visibility": grid, "turntable_deg": angle}, coords))
@@ -195,7 +196,10 @@ HOURS = {"units": "h", "long_name": "time since the first sample"}
 
 @dataclass(frozen=True)
 class SavedInformation:
-    """The information in data about the sky at one frequency, and the digests of these data."""
+    """The information in data about the sky at one frequency, and the digests of these data.
+
+    A digest is a hash, and the times of the first and the last sample.
+    """
 
     information: Information
     digests: tuple[str, ...]
@@ -208,7 +212,7 @@ class SavedInformation:
         InputError
             If they are already included.
         """
-        if digest in self.digests:
+        if digest.split()[0] in (known.split()[0] for known in self.digests):
             wrong = "the earlier posterior already includes these data; give only new ones"
             raise InputError(wrong)
         return information + self.information
@@ -336,6 +340,13 @@ def taken(observation: Observation) -> dict[str, Any]:
         "lon_deg": float(observation.lon_deg),
         "lat_deg": float(observation.lat_deg),
     }
+
+
+def taken_together(channels: Sequence[ChannelResult]) -> dict[str, Any]:
+    """The same for all channels: the first and the last time, and the largest number of times."""
+    parts = [channel.taken for channel in channels]
+    most = {"first": min, "last": max, "n_times": max}
+    return parts[0] | {name: of(part[name] for part in parts) for name, of in most.items()}
 
 
 class Provenance(BaseModel, frozen=True):

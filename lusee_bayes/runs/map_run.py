@@ -80,7 +80,8 @@ def run_map(
         given = _given(data, reduced, scenario, run.path)
         more = {"truth": truth, "earlier": earlier, "thorough": thorough, "engine": engine}
         made = map_channels(scenario, run.path, data=given, stages=stages, **more)
-        known_sky, times = made.stacked("truth") is not None, made.channel.taken
+        known_sky = made.stacked("truth") is not None
+        times = finished_runs.taken_together(made.channels)
         made = replace_fields(made, reduced=reduced and _as_used(reduced, made))
         provenance = finished_runs.Provenance.of(scenario, times, data, known_sky=known_sky)
         return run.write(made, stages, provenance)

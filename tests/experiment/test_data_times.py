@@ -10,6 +10,7 @@ their map differs from that of the fine samples with the covariance C_avg - C_fi
 from dataclasses import replace
 from typing import NamedTuple
 
+import h5py
 import numpy as np
 import pytest
 from assertions import refuse, within
@@ -62,6 +63,13 @@ def test_data_come_as_paths_or_in_memory(tmp_path, monkeypatch):
         assert found.digest() == read.digest() == digest_of(found)
     other = replace(read, frequency_mhz=30.0)
     assert lb.read_data([read, other], scenario("frequency_mhz=30")).frequency_mhz == 30.0
+    # of files, only that at the frequency is read
+    other.write(tmp_path / "other.nc")
+    with h5py.File(tmp_path / "other.nc", "a") as file:
+        file["visibility"][:] = np.nan
+    both = [path, tmp_path / "other.nc"]
+    assert lb.read_data(both, scenario()).digest() == read.digest()
+    refuse("visibility", lb.read_data, both, scenario("frequency_mhz=30"))
     averages = lb.read_data(read, scenario(f"observation.average_s={2 * STEP}"))
     assert averages.digest() == averaged(read, 2 * STEP).digest()
     for given, noun in (

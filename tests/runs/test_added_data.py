@@ -1,5 +1,6 @@
 """Data that are added to those of an earlier run: the map is that of all of them."""
 
+import json
 import re
 from dataclasses import replace
 
@@ -113,10 +114,16 @@ def test_from_the_command_line(tmp_path, capsys, monkeypatch):
     second = ("--set", "observation.start=2027-02-15", "--set", "seed=2")
     assert run("simulate", "fiducial", *SMALL, "-o", "a.nc", "-q") == 0
     assert run("simulate", "fiducial", *SMALL, *second, "-o", "b.nc", "-q") == 0
+    during = ("--set", "observation.start=2027-01-16", "--set", "seed=3")
+    assert run("simulate", "fiducial", *SMALL, *during, "-o", "c.nc", "-q") == 0
     mapped = ("map", "fiducial", *SMALL, "-q")
     assert run(*mapped, "--data", "a.nc", "--information", "-o", "first") == 0
     assert run(*mapped, "--data", "b.nc", *("--add", "first", "--information", "-o", "both")) == 0
     assert run(*mapped, "--data", "a.nc", "-o", "plain") == 0
+    assert run(*mapped, "--data", "c.nc", "--add", "both", "-o", "twice") == 0
+    for name, overlap in (("both", ""), ("twice", "overlap in time with earlier ones (2027-01-15")):
+        said = json.loads((tmp_path / name / "summary.json").read_text())["doubts"]
+        assert (overlap in " ".join(said)) if overlap else ("overlap" not in " ".join(said))
     scenario = lb.load_scenario("fiducial", list(SMALL[1::2]))
     files = (information_file(tmp_path / name) for name in ("both", "first"))
     saved, before = (read_information(file, scenario) for file in files)
