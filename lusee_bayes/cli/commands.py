@@ -479,8 +479,9 @@ def spectrum_command(
     spectrum = FinishedRun.read(run).sky_spectrum()
     templates = [named_template(one) for one in signal]
     limits = [signal_limit(spectrum, *one, region=region, order=order) for one in templates]
+    rows = table_of_numbers(*spectrum.rows(region)), *(limit.sentence() for limit in limits)
     say(f"{region} (share: of the variance that would vanish if it were known; shares overlap)")
-    say(table_of_numbers(*spectrum.rows(region)), *(limit.sentence() for limit in limits))
+    say(*rows)
     if figure is not None:
         from lusee_bayes.core.files import replacing, require_new
         from lusee_bayes.report.figures.drawing import save

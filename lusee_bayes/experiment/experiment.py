@@ -38,7 +38,7 @@ from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
 from lusee_bayes.systematics.beam import BeamErrors
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities
-from lusee_bayes.systematics.gain_drifts import GainDrifts
+from lusee_bayes.systematics.gain_drifts import GainDrifts, drift_within
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.sources import PointSources
 from lusee_bayes.systematics.systematic import Systematic
@@ -382,6 +382,8 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
                 f"{part.systematic.names[k]} is held at the end of its range, but data are more "
                 "probable beyond it: the errors of the map may not hold. Mistakes can look alike."
             )
+    if said := drift_within(setup.scenario.noise.gain, setup.observation):
+        notes.append(f"{said[0].upper()}{said[1:]}.")
     if setup.scenario.noise.radiometer.form == "exact":
         seen = noise_visibilities(setup, inference.around, radiometer_about(setup))
         if not (known := np.asarray(of_voltages(seen))).all():

@@ -306,8 +306,9 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
         # a spectrum of no frames has no data, whatever its live time
         live_s = np.where(share > 0.0, share, 1.0) * window
         windows = contiguous(times, window / 2.0, float(window.min()), live_s)
-        # a spectrum during which the turntable turns belongs to no angle
-        ends = (recipe.section.angles_at(later(times, s * window / 2.0)) for s in (-1.0, 1.0))
+        # a spectrum during which the turntable turns belongs to no angle; turns are stated to 1 ms
+        inner = window / 2.0 - 1e-3
+        ends = (recipe.section.angles_at(later(times, s * inner)) for s in (-1.0, 1.0))
         turns = np.split(np.not_equal(*ends), np.cumsum([s.n_rows for s in ordered])[:-1])
         pairs = zip(ordered, turns, strict=True)
         ordered = tuple(replace(s, share=np.where(turn, 0.0, s.share)) for s, turn in pairs)

@@ -18,6 +18,7 @@ from lusee_bayes.core.files import require_new, transaction, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
 from lusee_bayes.experiment.data_files import Data, names_of_data, read_data, reduce_files
+from lusee_bayes.experiment.experiment import observed
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
 from lusee_bayes.experiment.model import require_fitting, set_up, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
@@ -33,6 +34,7 @@ from lusee_bayes.runs.cost import require_fits, require_resources, simulation_co
 from lusee_bayes.runs.folder import RunKind, inputs_of, run_folder
 from lusee_bayes.runs.plan_run import expected_inference
 from lusee_bayes.systematics.context import Setup
+from lusee_bayes.systematics.gain_drifts import drift_within
 
 
 def run_simulate(
@@ -394,8 +396,10 @@ def run_average(
         fine = read_data(data, scenario)
         with naming(names_of_data(data)[0]):
             coarse = averaged(fine, to_s)
+    require_fitting(fine, scenario)
+    if said := drift_within(scenario.noise.gain, coarse.observation):
+        raise InputError(said)
     if information:
-        require_fitting(fine, scenario)
         require_resources(scenario, fine, stages)
     coarse.write(path)
     if not information:
@@ -407,4 +411,5 @@ def run_average(
 
 
 def _bits(scenario: Scenario, data: Visibilities) -> float:
-    return float(expected_inference(set_up(scenario, data)).posterior.information_bits())
+    setup = observed(scenario.of_measured(), data).setup
+    return float(expected_inference(setup).posterior.information_bits())

@@ -77,9 +77,18 @@ def inputs_of(
 ) -> list[str | Path]:
     """The files that a run reads: data, files named by its scenario, and others if given."""
     tree = {} if scenario is None else scenario.model_dump(mode="json")
-    named = [value for _, value in _entries(tree) if isinstance(value, str)]
+    named = _texts(tree)
     given = [] if data is None else files_of(data)
     return [*given, *filter(os.path.isfile, named), *filter(None, others)]
+
+
+def _texts(tree: Any) -> Iterator[str]:
+    """All texts of a tree of mappings and lists."""
+    if isinstance(tree, str):
+        yield tree
+    elif isinstance(tree, Mapping | list):
+        for value in tree.values() if isinstance(tree, Mapping) else tree:
+            yield from _texts(value)
 
 
 def _entries(tree: Mapping[str, Any], parents: str = "") -> Iterator[tuple[str, Any]]:

@@ -135,6 +135,8 @@ def variations_of(
 ) -> list[Variation]:
     """List the variations to forecast: every scenario as it is, then its variations.
 
+    All are of measured data (:meth:`.Scenario.of_measured`).
+
     Parameters
     ----------
     sources : sequence of str
@@ -158,7 +160,7 @@ def variations_of(
         if vary:
             variations += given_variations(source, vary, overrides)
             continue
-        first, *others = default_variations(source, load_scenario(source, overrides))
+        first, *others = default_variations(source, load_scenario(source, overrides).of_measured())
         variations.append(first)
         for one in others:
             try:
@@ -174,7 +176,8 @@ def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str])
 
     InputError if one of them does not have that form, or a value is invalid for the scenario.
     """
-    variations = [Variation(source, AS_GIVEN, AS_GIVEN, load_scenario(source, overrides))]
+    given = load_scenario(source, overrides).of_measured()
+    variations = [Variation(source, AS_GIVEN, AS_GIVEN, given)]
     for text in vary:
         key, _, listed = text.partition("=")
         values = parse_yaml(f"[{listed}]", f"--vary {text}")
@@ -182,7 +185,7 @@ def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str])
             raise InputError(f"--vary expects key.path=value,value (as seed=1,2), got '{text}'")
         for value in values:
             change = f"{key}={json.dumps(value, default=str)}"
-            scenario = load_scenario(source, [*overrides, change])
+            scenario = load_scenario(source, [*overrides, change]).of_measured()
             variations.append(Variation(source, key, f"{value}", scenario))
     return variations
 

@@ -470,6 +470,7 @@ def run_validate(
         For too few draws or simulations, and as :func:`run_sample`.
     """
     scenario, stages = load_scenario(scenario), stages or Stages()
+    scenario = scenario if data is None else scenario.of_measured()
     sampler = sampler or Sampler(seed=scenario.seed)
     scenario.require_single("a validation has")
     program = programs.load_program("sky")

@@ -17,6 +17,7 @@ from lusee_bayes.core.arrays import Array, DataVector, Grid
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.section import NOT_TINY, Positive, Section, Treatment, requires
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian, Solution
 from lusee_bayes.noise.instrument_errors import (
@@ -83,6 +84,24 @@ class GainSection(Section):
     _scales_are_sampled = requires(
         lambda s: s.treatment != "marginalised" or not (s.log_sigma_std or s.log_correlation_std),
         "log_sigma_std and log_correlation_std need treatment 'sampled': a covariance is fixed",
+    )
+
+
+# longest window over which gains are as if constant, in correlation times
+STEADY = 0.25
+
+
+def drift_within(section: GainSection | None, observation: Observation) -> str:
+    """A sentence if gains drift within windows, which N does not describe; empty otherwise."""
+    if section is None or section.treatment == "ignored" or observation.windows is None:
+        return ""
+    longest, most_h = observation.step_s / 3600.0, STEADY * section.correlation_h
+    if longest <= most_h:
+        return ""
+    return (
+        f"gains drift during a mean over {longest:.3g} h (noise.gain.correlation_h is "
+        f"{section.correlation_h:g}), which the model does not include; average over at most "
+        f"{most_h:.3g} h"
     )
 
 

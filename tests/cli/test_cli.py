@@ -248,6 +248,7 @@ def test_what_ends_a_run(small_map, tmp_path, monkeypatch, capsys, fail, code, w
 def test_force_does_not_replace_what_the_run_reads(small_map, tmp_path, capsys):
     out = Path(shutil.copytree(small_map.folder, tmp_path / "out"))
     before = content(out)
+    survey = f"{{model: local_scales, surveys: [{{file: {out}/map.fits, frequency_mhz: 25}}]}}"
     for command in (
         ["map", out / "scenario.yaml", "-o", out],
         ["map", "fiducial", *SMALL, "--set", f"sky.file={out}/map.fits", "-o", out],
@@ -255,6 +256,7 @@ def test_force_does_not_replace_what_the_run_reads(small_map, tmp_path, capsys):
         ["map", "fiducial", *SMALL, "--add", out, "-o", out],
         ["compare", out, small_map.folder, "-o", out],
         ["simulate", out / "scenario.yaml", "-o", out / "scenario.yaml"],
+        ["simulate", "fiducial", *SMALL, "--set", f"prior={survey}", "-o", out / "map.fits"],
     ):
         assert "is an input of this run" in refused(capsys, *command, "--force", "-q")
         assert content(out) == before

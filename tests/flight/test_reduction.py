@@ -258,6 +258,10 @@ def test_the_turntable_turns_when_the_scenario_says(flight, table, reduced):
     given = recipe(table, timestamp="start", turns={(times[3] + 60.0 * u.s).isot: 30.0})
     one = reduce_sessions([at, *sessions(flight, "bcd")], given)
     np.testing.assert_array_equal(one.reason[:, 2:5] == rd.NO_DATA, [[False, True, False]] * 2)
+    # turns are stated to a millisecond: here 0.4 ms into a spectrum
+    given = recipe(table, timestamp="start", turns={(times[3] + 4e-4 * u.s).isot: 30.0})
+    one = reduce_sessions([at, *sessions(flight, "bcd")], given)
+    assert not (one.reason[:, 2:5] == rd.NO_DATA).any()
     given = recipe(table, turns={"noon": 3})
     refuse("flight.turns.*noon", reduce_sessions, sessions(flight), given)
 

@@ -93,6 +93,8 @@ BAD_INPUT = [
     (["--to", "2h", "-o", "w.fits"], "give -o a name without .fits"),
     (["--to", "2h", "-o", "data.nc"], "data.nc' is an input of this run"),
     (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25 MHz"),
+    (["--to", "2h", "--set", "frequency_mhz=9", "--no-information"], "the data are at 25 MHz"),
+    (["--to", "3h", "--set", "noise.gain={correlation_h: 10}"], "average over at most 2.5 h"),
     (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages have one frequency"),
     (["--to", "2h", "--set", "observation.timestamp=start"], "remove that"),
 ]
