@@ -238,9 +238,6 @@ class Scenario(Section):
                 "noise.beam.parameters describe the embedded antennas, which beam.file replaces; "
                 "use noise.beam.shift_mhz or noise.beam.file, or a grid of files (beam.model=grid)"
             )
-        if (self.beam.is_file or (error is not None and error.file is not None)) and own_sources:
-            wrong = "sources.list needs exact embedded beams; remove beam.file and noise.beam.file"
-            raise ValueError(wrong)
         if self.joint and (prior.has_files or prior.surveys or getattr(prior, "scale", 1.0) != 1.0):
             wrong = "joint uses the spectral prior; remove files, surveys and scale of the prior"
             raise ValueError(wrong)

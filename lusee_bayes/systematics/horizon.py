@@ -45,7 +45,7 @@ from lusee_bayes.core.reading import read_table
 from lusee_bayes.core.section import NOT_TINY, Section, Temperature, Treatment, requires
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.instrument.pointing import offset_names, with_offsets
-from lusee_bayes.instrument.products import auto_indices, to_real
+from lusee_bayes.instrument.products import to_real
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values, with_added
 
@@ -169,7 +169,7 @@ class Horizon(ChangedBeams):
 
     @classmethod
     def build(cls, section: HorizonSection, setup: Setup, around: Around) -> Horizon:
-        source, beams, whole = setup.beam_source, setup.beams, HemisphereGrid.for_lmax(0)
+        source, beams = setup.beam_source, setup.beams
         ahead = np.radians(np.array(setup.observation.turntable_deg))[:, None]
         azimuth = np.pi / 2.0 - ahead - 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
         altitude = section.altitude_at(azimuth)
@@ -178,16 +178,14 @@ class Horizon(ChangedBeams):
             raise InputError(wrong)
         highest = min(float(altitude.max() + np.radians(REACH * section.std_deg)), np.pi / 2.0)
         # polynomials that follow the patterns, and the harmonics: lmax radians per radian
-        grids = _rings(24 + int(highest * beams.lmax), highest), whole
-        sampled = [to_real(source.patterns(beams.frequency_mhz, grid)) for grid in grids]
-        patterns, all_round = map(np.asarray, sampled)
-        autos = auto_indices(source.n_ports)
-        scale = np.asarray(beams.modes)[autos, 0].mean() / whole.modes(all_round, 0)[autos].mean()
+        frequency, grid = beams.frequency_mhz, _rings(24 + int(highest * beams.lmax), highest)
+        patterns = np.asarray(to_real(source.patterns(frequency, grid)))
+        patterns = patterns * source.pattern_scale(frequency)
         before = 0.0 if setup.hidden is None else setup.hidden
         orders, std_deg = section.harmonics, section.std_deg / (1.0 + section.harmonics) ** 0.5
         waves = [f"{wave}_{k}_" for k in range(1, orders + 1) for wave in ("cos", "sin")]
         unknowns = tuple(Unknown(f"horizon_{wave}deg", 0.0, std_deg) for wave in ("", *waves))
-        parts = patterns * scale, azimuth, altitude, before, highest, beams.lmax
+        parts = patterns, azimuth, altitude, before, highest, beams.lmax
         return cls(unknowns, *parts, section.moon_temperature_k)
 
     @classmethod

@@ -18,11 +18,13 @@ from jaxtyping import Float, Int
 from pydantic import Field
 
 from lusee_bayes.core.arrays import Array, DataVector, namespace, on_device
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import Rotation, generators
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment, requires
 from lusee_bayes.instrument import pointing as pointings
-from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
+from lusee_bayes.instrument.beams.monopoles import Monopoles
+from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.sources import SOURCE_NODES, source_responses
@@ -177,7 +179,11 @@ class PointingOffsets(Systematic):
         device, of_sources = on_device(self), 0.0
         orientation, slopes = _slopes(*on_device((self, centre)))
         if self.sources is not None:  # the derivative of their beams would compile for a minute
-            seen = eqx.filter_jit(lambda at: device.sources.seen(at, device.layout))
+
+            def seen(at):
+                return device.sources.seen(at, device.layout)
+
+            seen = eqx.filter_jit(seen) if isinstance(self.sources.beams, Monopoles) else seen
             ways = self.differences(lambda values: seen(device.orientation(values)), centre)
             of_sources = np.stack([*ways], axis=1)
         turn = np.einsum("tji,tjkn->tikn", np.asarray(orientation), np.asarray(slopes))
@@ -244,7 +250,7 @@ class MovingSources(eqx.Module):
         The sample of each instant.
     weight : (instants,) array
         Of each in the mean over its sample.
-    monopoles : Monopoles
+    beams : BeamSource
     frequency_mhz : float
     in_signal : (data,) array
         Their part of the data that the signal already contains, in K.
@@ -255,13 +261,19 @@ class MovingSources(eqx.Module):
     stokes_v: Float[Array, " sources"] | None
     sample: Int[Array, " instants"]
     weight: Float[Array, " instants"]
-    monopoles: Monopoles
+    beams: BeamSource
     frequency_mhz: float = eqx.field(static=True)
     in_signal: Float[Array, " data"]
 
     @classmethod
     def of(cls, setup: Setup) -> MovingSources:
-        """The sources of a setup."""
+        """The sources of a setup. InputError if they have to be differentiable, but are not."""
+        sampled = PointingOffsets.treatment(setup.scenario) == "sampled"
+        if sampled and not isinstance(setup.beam_source, Monopoles):
+            raise InputError(
+                "sources seen by beams of files cannot be sampled with clock and pointing; use "
+                "noise.pointing.treatment=marginalised"
+            )
         instants, sample, weight = setup.observation.at_nodes(SOURCE_NODES)
         sections = setup.scenario.sources.list
         vectors = [np.broadcast_to(s.direction(instants), (len(sample), 3)) for s in sections]
@@ -273,7 +285,7 @@ class MovingSources(eqx.Module):
             circular if circular.any() else None,
             sample,
             weight,
-            setup.beam_source.monopoles,
+            setup.beam_source,
             setup.beams.frequency_mhz,
             setup.layout.gather(np.tensordot(fluxes, np.stack(setup.responses), 1)),
         )
@@ -282,10 +294,10 @@ class MovingSources(eqx.Module):
         """Their signal in the data, in K; differentiable except where a source rises or sets."""
         turned = jnp.einsum("sti,tij->stj", self.directions, orientation[self.sample])
         shape = (layout.n_products, *turned.shape[:2])
-        inputs = (self.frequency_mhz, turned.reshape(-1, 3), self.monopoles)
-        response = beams_towards(*inputs).reshape(shape)
+        inputs = self.frequency_mhz, turned.reshape(-1, 3)
+        response = self.beams.response(*inputs).reshape(shape)
         if self.stokes_v is not None:
-            circular = beams_towards(*inputs, stokes="V").reshape(shape)
+            circular = self.beams.response(*inputs, "V").reshape(shape)
             response = response + self.stokes_v[None, :, None] * circular
         both = jnp.einsum("kst,s,t->kt", response, self.fluxes, self.weight)
         grid = jnp.zeros((layout.n_products, layout.n_times)).at[:, self.sample].add(both)

@@ -170,8 +170,6 @@ def source_responses(
 ) -> tuple[Grid, ...]:
     """Response to 1 K sr of each of a scenario's sources, with these beams, in K.
 
-    Sources need the exact pattern, which only the embedded antennas have.
-
     Responses are means over instants of each window, in which a source may rise and set.
     """
     if not scenario.sources.list:
@@ -179,7 +177,7 @@ def source_responses(
     instants, sample, weight = observation.at_nodes(SOURCE_NODES)
     first, responses = np.searchsorted(sample, np.arange(observation.n_times)), []
     for one in scenario.sources.list:
-        towards, antennas = one.direction(instants), beams.monopoles
-        seen = source_response(instants, towards, frequency_mhz, antennas, stokes_v=one.stokes_v)
+        towards = one.direction(instants)
+        seen = source_response(instants, towards, frequency_mhz, beams, stokes_v=one.stokes_v)
         responses.append(np.add.reduceat(np.asarray(seen) * weight, first, axis=1))
     return tuple(responses)

@@ -243,7 +243,7 @@ def test_sources_are_seen_as_means_over_windows():
     """Cas A rises, sets and turns within windows of a day: against 400 instants in each."""
     setup = set_up(scenario_of("sources.list=[{name: Cas A}]", lmax=4, step_s=86400.0))
     instants, sample, weight = setup.observation.at_nodes(400)
-    antennas, direction = setup.beam_source.monopoles, galactic_unit_vector(350.85, 58.815)
+    antennas, direction = setup.beam_source, galactic_unit_vector(350.85, 58.815)
     fine = np.asarray(source_response(instants, direction, 25.0, antennas)) * weight
     expected = np.stack([np.bincount(sample, row) for row in fine])
     got = np.asarray(setup.responses[0])

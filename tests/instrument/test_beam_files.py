@@ -17,6 +17,7 @@ from reference import hemisphere, real_harmonics
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import moved, set_up, true_signal, true_values
+from lusee_bayes.experiment.unknowns import flux_table
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, ProductBeams, product_modes
 from lusee_bayes.instrument.beams.luseepy_files import FIELD_NAMES, parts_of
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
@@ -244,7 +245,6 @@ def test_a_second_file_as_the_true_beams(tmp_path):
 NOT_OF_A_FILE = [
     (["beam.length_m=2"], "length_m belongs to model monopole, not to luseepy"),
     (["noise.beam={parameters: {length_m: 0.1}}"], "which beam.file replaces"),
-    (["sky.sources=false", "sources.list=[{name: Cas A}]"], "needs exact embedded beams"),
     (["noise.beam={shift_mhz: 1, file: some.fits}"], "give either shift_mhz, file or param"),
 ]
 
@@ -252,6 +252,22 @@ NOT_OF_A_FILE = [
 @pytest.mark.parametrize(("overrides", "message"), NOT_OF_A_FILE)
 def test_what_a_file_does_not_have(overrides, message):
     refuse(message, lb.load_scenario, "fiducial", ["beam.file=some.fits", *overrides])
+
+
+POINTED = "noise.pointing={turntable_deg: 0.5}"
+
+
+def test_sources_are_seen_by_beams_of_files(tmp_path):
+    """Fluxes are found, the turntable unknown; where it is sampled, it is refused."""
+    seen = "sources.list=[{name: Cas A}, {name: Sun, flux_jy: 2e4}]"
+    own = f"beam.file={write(tmp_path / 'beam.fits')}", seen, "noise.radiometer.factor=100"
+    experiment = lb.build(small_scenario(*own, POINTED, lmax=3, cycles=0.5))
+    found = flux_table(experiment, lb.infer(experiment))
+    off_by = (found["flux_jy"] - found["true_jy"]).abs()
+    assert (off_by < 4.0 * found["std_jy"]).all()
+    assert (found["std_jy"] < 0.2 * found["prior_std_jy"]).all()
+    sampled = POINTED.replace("0.5", "0.5, treatment: sampled")
+    refuse("cannot be sampled with clock and pointing", lb.build, small_scenario(*own, sampled))
 
 
 def test_the_program_of_the_instrument_needs_the_embedded_antennas(tmp_path):

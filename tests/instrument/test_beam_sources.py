@@ -7,6 +7,7 @@ import pytest
 from assertions import refuse
 
 from lusee_bayes.instrument.beams import monopoles, sampled
+from lusee_bayes.instrument.beams.fields import HemisphereGrid, beam_scale, product_modes
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.testing import check_beam_source
 
@@ -68,9 +69,25 @@ def test_response_beams(response, options, quadrature):
     np.testing.assert_array_equal(kelvin, response.per_kelvin(FREQUENCY))
 
 
-def test_a_file_has_no_embedded_antennas_and_no_other_frequencies(scalar, response):
+@pytest.mark.parametrize("kind", ["scalar", "response"])
+def test_what_is_seen_in_directions_adds_up_to_the_beams(kind, request):
+    """Splines of half a degree, integrated with harmonics over a grid of other directions."""
+    source, grid = request.getfixturevalue(kind), HemisphereGrid.for_lmax(LMAX)
+    theta, phi = (x.ravel() for x in np.meshgrid(grid.theta, grid.phi, indexing="ij"))
+    ring = np.sin(theta) * np.exp(1j * phi)
+    directions = np.stack([ring.real, ring.imag, np.cos(theta)], axis=1)
+    beams, fields = source.beams(FREQUENCY, LMAX), source.fields(FREQUENCY, grid)
+    circular = product_modes(fields, LMAX, stokes="V", normalise=False)
+    expected = {"I": beams.modes, "V": beam_scale(fields, beams) * np.asarray(circular)}
+    for stokes, modes in expected.items():
+        seen = source.response(FREQUENCY, directions, stokes).reshape(16, -1, grid.n_phi)
+        found = grid.modes(seen, LMAX)
+        np.testing.assert_allclose(found, modes, atol=1e-7 * np.abs(beams.modes).max())
+        assert not source.response(FREQUENCY, directions * [1.0, 1.0, -1.0], stokes).any()
+
+
+def test_a_file_has_no_other_frequencies(scalar, response):
     for source in (replace(scalar, moon_k=250.0), replace(response, moon_k=250.0)):
-        refuse(r"embedded antennas, which beam\.file replaces", getattr, source, "monopoles")
         for ask in (lambda f, s=source: s.beams(f, 2), source.background):
             refuse("50 MHz.* 51", ask, 51.0)
     refuse("50 MHz.* 51", scalar.impedance, 51.0)

@@ -195,10 +195,6 @@ class Monopoles(BeamSource, eqx.Module):
     def n_ports(self) -> int:
         return self.azimuths_deg.size
 
-    @property
-    def monopoles(self) -> Monopoles:
-        return self
-
     def parameters(self) -> dict[str, Parameter]:
         return {n: Parameter(where(self), *ends) for n, (where, *ends) in PARAMETERS.items()}
 
@@ -211,6 +207,9 @@ class Monopoles(BeamSource, eqx.Module):
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         return monopole_beams(frequency_mhz, lmax, self, nodes=self.nodes)
+
+    def response(self, frequency_mhz, directions, stokes="I"):
+        return beams_towards(frequency_mhz, directions, self, stokes=stokes)
 
     def fields(self, frequency_mhz: Scalar, grid: HemisphereGrid) -> AntennaFields:
         """Return the field patterns on a grid, with the phase centre at the feed for all arms."""
@@ -397,14 +396,15 @@ def source_response(
     observation: Observation,
     galactic: Float[np.ndarray, "..."],
     frequency_mhz: Scalar,
-    monopoles: Monopoles | None = None,
+    antennas: BeamSource | None = None,
     *,
     stokes_v: float | Float[Array, ""] = 0.0,
 ) -> Float[Array, "products times"]:
     """Return the visibilities of a source of 1 K sr at every sample.
 
     V_k(t) = B_k^I(n(t)) + stokes_v B_k^V(n(t)), since I = 1 K sr and V = stokes_v I. Multiply by
-    the flux in K sr, constant or (times,). Differentiable in ``monopoles`` and ``stokes_v``.
+    the flux in K sr, constant or (times,). Differentiable in ``stokes_v`` and in
+    the embedded antennas.
 
     Parameters
     ----------
@@ -412,8 +412,8 @@ def source_response(
     galactic : (3,) or (times, 3) array
         As for :meth:`.Observation.antenna_directions`.
     frequency_mhz : float
-    monopoles : Monopoles, optional
-        By default the paper's antennas.
+    antennas : BeamSource, optional
+        By default the paper's.
     stokes_v : float
         V / I with the IAU's sign. If it is positive, a receiver that looks towards the source
         sees the electric field turn counter-clockwise (right-handed).
@@ -432,7 +432,8 @@ def source_response(
     if not is_traced(stokes_v) and not abs(stokes_v) <= 1.0:
         raise InputError(f"stokes_v is the fraction V / I, from -1 to 1, got {stokes_v}")
     directions = observation.antenna_directions(galactic)
-    response = beams_towards(frequency_mhz, directions, monopoles)
+    antennas = Monopoles() if antennas is None else antennas
+    response = antennas.response(frequency_mhz, directions)
     if not is_traced(stokes_v) and stokes_v == 0.0:
         return response
-    return response + stokes_v * beams_towards(frequency_mhz, directions, monopoles, stokes="V")
+    return response + stokes_v * antennas.response(frequency_mhz, directions, "V")

@@ -14,6 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -23,15 +24,18 @@ from pydantic import BeforeValidator, Field
 from scipy.constants import Boltzmann
 
 from lusee_bayes.core.arrays import Array, Values
-from lusee_bayes.core.errors import InputError, require_known
+from lusee_bayes.core.errors import require_known
 from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.core.section import LARGEST, Positive, Section
 from lusee_bayes.instrument.beams import fields as beam_fields
-from lusee_bayes.instrument.products import N_ANTENNAS
+from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices, to_real
 
 Ohms = Complex[np.ndarray, "ports ports"]
 Lines = Float[np.ndarray, "lines products modes"]
+# grid of half a degree, on which patterns are interpolated to directions, and columns that overlap
+N_FINE, N_PHI, MARGIN = 181, 720, 8
 # matrices of the ports at every frequency
 LOADS, BY_PORTS = ("ZL_real", "ZL_imag"), ("freq", N_ANTENNAS, N_ANTENNAS)
 LOADS_LAYOUT = Layout(
@@ -353,6 +357,43 @@ class BeamSource(ABC):
         """
         return beam_fields.stokes_beam(self.fields(frequency_mhz, grid))
 
+    def pattern_scale(self, frequency_mhz: float) -> float:
+        """Return the factor that turns :meth:`patterns` into beams in K per K, in 1/sr."""
+        whole, autos = beam_fields.HemisphereGrid.for_lmax(0), auto_indices(self.n_ports)
+        patterns = np.asarray(to_real(self.patterns(frequency_mhz, whole)))
+        modes = np.asarray(self.beams(frequency_mhz, 0).modes)
+        return float(modes[autos, 0].mean() / whole.modes(patterns, 0)[autos].mean())
+
+    def response(
+        self, frequency_mhz: float, directions: Float[Array, "directions 3"], stokes: str = "I"
+    ) -> Float[Array, "products directions"]:
+        """Return the beams B_k(n) in directions n, where a source of 1 K sr adds B_k(n) kelvin.
+
+        By cubic splines of the patterns on a grid of half a degree.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+        directions : (directions, 3) array
+            Unit vectors: East, North, up in the frame of the antennas.
+        stokes : {"I", "Q", "U", "V"}
+
+        Returns
+        -------
+        (products, directions) array
+            In 1/sr; zero where up <= 0.
+
+        Raises
+        ------
+        InputError
+            As :meth:`patterns`, or :meth:`fields` unless ``stokes`` is "I".
+        """
+        east, north, up = np.asarray(directions).T
+        at = np.arctan2(np.hypot(east, north), up), np.arctan2(north, east) % (2.0 * np.pi)
+        splines = _splines(self, frequency_mhz, stokes)
+        seen = np.stack([spline(*at, grid=False) for spline in splines])
+        return np.where(up > 0.0, seen, 0.0)
+
     @abstractmethod
     def beams(self, frequency_mhz: float, lmax: int) -> beam_fields.ProductBeams:
         """Return the beams of all products.
@@ -459,8 +500,16 @@ class BeamSource(ABC):
         """Return errors of beams that are interpolated in parameters, by the node of each."""
         return {}
 
-    @property
-    def monopoles(self) -> BeamSource:
-        """The embedded antennas; InputError if the beams come from a file."""
-        wrong = "this needs the embedded antennas, which beam.file replaces; remove beam.file"
-        raise InputError(wrong)
+
+@lru_cache(maxsize=4)
+def _splines(source: BeamSource, frequency_mhz: float, stokes: str) -> list[Any]:
+    """Splines of the beams of all products in theta and phi, in 1/sr."""
+    theta = np.linspace(0.0, np.pi / 2.0, N_FINE)
+    grid = beam_fields.HemisphereGrid(theta, np.zeros(N_FINE), N_PHI)
+    patterns = source.patterns(frequency_mhz, grid)
+    if stokes != "I":
+        patterns = beam_fields.stokes_beam(source.fields(frequency_mhz, grid), stokes)
+    beams = np.asarray(to_real(patterns)) * source.pattern_scale(frequency_mhz)
+    around = np.pad(beams, ((0, 0), (0, 0), (MARGIN, MARGIN)), "wrap")
+    phi = 2.0 * np.pi / N_PHI * np.arange(-MARGIN, N_PHI + MARGIN)
+    return [interpolate.RectBivariateSpline(theta, phi, one) for one in around]
