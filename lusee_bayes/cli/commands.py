@@ -397,7 +397,7 @@ def compare_command(*folders: Path, options: option.Options = option.Options()) 
     Parameters
     ----------
     folders
-        Two or more result folders of map.
+        Two or more result folders of map, each of one frequency.
     """
     from lusee_bayes.cli.tables import comparison_table
     from lusee_bayes.results.finished_runs import evidence_caveat
