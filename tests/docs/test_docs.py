@@ -30,7 +30,8 @@ from lusee_bayes.sampling.mode import estimate_evidence
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = [DOCS / "extend.md", *sorted((DOCS / "howto").glob("*.md"))]
-SMALL = ["--set", "lmax=4", "--set", "observation.step_s=86400"]
+TOP = "noise.above_lmax={margin: 2, least_lmax: 0}"
+SMALL = ["--set", "lmax=4", "--set", "observation.step_s=86400", "--set", TOP]
 SIZES = re.compile(r"\b(lmax=|LMAX = )\d+")
 FENCES = re.compile(r"^```(python|sh)\n(.*?)^```", flags=re.DOTALL | re.MULTILINE)
 
