@@ -124,7 +124,7 @@ class Information(Described, eqx.Module):
         require_shape(what, other.reference, (self.n_modes,))
         moved = other.recentred(self.reference)
         names = ("matrix", "vector", "misfit", "log_det", "n_data")
-        return replace(self, **{n: np.asarray(getattr(self, n) + getattr(moved, n)) for n in names})
+        return self.altered(**{name: getattr(self, name) + getattr(moved, name) for name in names})
 
     def raised(self, factor: float) -> Information:
         """Information of the same data with N multiplied by a factor.
@@ -134,13 +134,12 @@ class Information(Described, eqx.Module):
         factor : float
             Of N, positive.
         """
-        return replace(
-            self,
-            matrix=self.matrix / factor,
-            vector=self.vector / factor,
-            misfit=np.asarray(self.misfit / factor),
-            log_det=np.asarray(self.log_det + self.n_data * np.log(factor)),
-        )
+        shares = {name: getattr(self, name) / factor for name in ("matrix", "vector", "misfit")}
+        return self.altered(**shares, log_det=self.log_det + self.n_data * np.log(factor))
+
+    def altered(self, **numbers: float | Array) -> Information:
+        """Return the information with these attributes, as NumPy arrays."""
+        return replace(self, **{name: np.asarray(value) for name, value in numbers.items()})
 
     def chi2(self, sky: Modes) -> Float[Array, ""]:
         """Compute ``chi^2 = |L^-1 (d - A m - offset)|^2`` of a sky.
