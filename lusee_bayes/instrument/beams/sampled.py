@@ -38,15 +38,8 @@ from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.layouts import Attribute, Kind, Layout, Variable
 from lusee_bayes.core.lazy import healpy, pyuvdata
 from lusee_bayes.core.reading import naming, reading, require_file
-from lusee_bayes.instrument.beams.fields import (
-    AntennaFields,
-    HemisphereGrid,
-    Pairs,
-    ProductBeams,
-    at_frequency,
-    from_rings,
-    on_grid,
-)
+from lusee_bayes.instrument.beams import fields as beam_fields
+from lusee_bayes.instrument.beams.fields import AntennaFields, HemisphereGrid, ProductBeams, on_grid
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, to_matrix, to_real
@@ -150,7 +143,7 @@ class Directions:
     def scalars_on(self, values: Sampled, grid: HemisphereGrid, turn_deg: float) -> OnGrid:
         """Interpolate functions, turned from East towards North, to a grid."""
         if self.theta is None:
-            return from_rings(values, grid.theta, grid.phi - np.radians(turn_deg))
+            return beam_fields.from_rings(values, grid.theta, grid.phi - np.radians(turn_deg))
         turned = [on_grid(one.astype(np.complex128), self.theta, grid, turn_deg) for one in values]
         return np.stack(turned) if np.iscomplexobj(values) else np.stack(turned).real
 
@@ -167,7 +160,7 @@ class Directions:
         theta, phi = healpy.pix2ang(self.nside, np.arange(e_theta.shape[-1]))
         along = [a * e_theta + b * e_phi for a, b in zip(*_axes(theta, phi), strict=True)]
         own_phi = grid.phi - np.radians(turn_deg)
-        fixed = [from_rings(one, grid.theta, own_phi) for one in along]
+        fixed = [beam_fields.from_rings(one, grid.theta, own_phi) for one in along]
         back = _axes(grid.theta[:, None], own_phi[None])
         return tuple(sum(a * one for a, one in zip(axis, fixed, strict=True)) for axis in back)
 
@@ -243,14 +236,15 @@ class SampledBeams(Described, BeamSource):
         turned = self.directions.vectors_on(*parts, grid, self.turntable_offset_deg)
         return AntennaFields(*turned, grid)
 
-    def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> Pairs:
+    def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> beam_fields.Pairs:
         if self.products is None:
             return super().patterns(frequency_mhz, grid)
         (beams,) = self._at(frequency_mhz, self.products)
         return to_matrix(self.directions.scalars_on(beams, grid, self.turntable_offset_deg))
 
     def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
-        return at_frequency(self.path, self.frequencies_mhz, frequency_mhz, *parts, rule="spline")
+        mhz = self.frequencies_mhz
+        return beam_fields.at_frequency(self.path, mhz, frequency_mhz, *parts, rule="spline")
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         """Return the beams of all products in K per K.
