@@ -82,9 +82,8 @@ class Posterior(Described, eqx.Module):
         (n, n) array
             In K^2.
         """
-        theta, phi = np.radians(90.0 - np.asarray(lat_deg)), np.radians(np.asarray(lon_deg))
         root = np.asarray(self.root())
-        rows = harmonics.synthesis_matrix(theta, phi, harmonics.lmax_of(len(root))) @ root
+        rows = harmonics.harmonics_at(lon_deg, lat_deg, harmonics.lmax_of(len(root))) @ root
         return rows @ rows.T
 
     def std(self) -> Float[Array, " unknowns"]:

@@ -140,9 +140,8 @@ def describe_folder(folder: Path) -> list[str]:
         wrong = f"'{folder}' is not the folder of a run: no manifest.json; give a file or a folder"
         raise InputError(wrong)
     lines = [f"results of lusee-bayes {manifest['kind']}"]
-    provenance = "lusee_bayes.results.finished_runs:Provenance"
     if "provenance.json" in manifest["files"]:
-        facts = resolve_name(provenance).read(folder)
+        facts = resolve_name("lusee_bayes.results.finished_runs:Provenance").read(folder)
         lines += [
             f"data: {facts.data_line()}",
             f"{facts.first} to {facts.last} UTC, {facts.n_times} times, site {facts.lon_deg:g}, "

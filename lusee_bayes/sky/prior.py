@@ -250,16 +250,14 @@ class DiagonalPrior(Prior):
     def colour(self, u):
         return u * self.widths.reshape(*(1,) * (u.ndim - 1), -1)
 
-    def colour_columns(self, a):
-        return self.colour(a)
+    colour_columns = colour
 
     def whiten(self, m):
         xp, root = namespace(m, self), self.widths.reshape(*(1,) * (m.ndim - 1), -1)
         power = root != 0
         return m * xp.where(power, 1.0 / xp.where(power, root, 1.0), 0.0)
 
-    def whiten_columns(self, a):
-        return self.whiten(a)
+    whiten_columns = whiten
 
     def sandwich(self, matrix):
         return linalg.scaled(matrix, self.widths)

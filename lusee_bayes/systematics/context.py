@@ -243,10 +243,8 @@ class Setup:
 
         Of all ports used, it depends on the autos, and in the exact form on the crosses, too.
         """
-        seen, (first, second, _) = (
-            np.asarray(self.layout.present).any(1),
-            ports(self.beam_source.n_ports),
-        )
+        seen = np.asarray(self.layout.present).any(1)
+        first, second, _ = ports(self.beam_source.n_ports)
         used = np.union1d(first[seen], second[seen])
         needed = np.isin(first, used) & np.isin(second, used)
         if self.scenario.noise.radiometer.form != "exact":

@@ -194,9 +194,8 @@ class GainDrifts(systematic.Systematic):
         """Multiply by one draw of the drifts."""
         drift = GainDrift(truth["gain_sigma"], truth["gain_correlation_h"])
         gains = drift.sample(cls.own_key(key), setup.observation.hours)
-        return systematic.multiplied(
-            model, np.asarray(cls.build(section, setup, Around()).response(gains))
-        )
+        response = cls.build(section, setup, Around()).response(gains)
+        return systematic.multiplied(model, np.asarray(response))
 
     @property
     def n_antennas(self) -> int:

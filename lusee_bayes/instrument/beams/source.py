@@ -168,10 +168,8 @@ class MeasuredReceiver(Receiver):
     load_ohm: Complex[np.ndarray, "frequencies ports ports"]
 
     def load(self, frequency_mhz: float) -> Ohms:
-        (ohm,) = beam_fields.at_frequency(
-            self.path, self.frequencies_mhz, frequency_mhz, self.load_ohm
-        )
-        return ohm
+        mhz = self.frequencies_mhz
+        return beam_fields.at_frequency(self.path, mhz, frequency_mhz, self.load_ohm)[0]
 
 
 def receiver_of(
