@@ -28,9 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core import linalg
+from lusee_bayes.core import checks, linalg
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Square, Vector, on_host
-from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.linear.information import Information, precision_root
 from lusee_bayes.linear.posterior import Posterior
@@ -390,7 +389,7 @@ def channel_sky(
     """
     n = n_modes(prior.lmax)
     shared = information.n_modes - n
-    require_shape("the mean of all unknowns", mean, (prior.n_components * n + shared,))
+    checks.require_shape("the mean of all unknowns", mean, (prior.n_components * n + shared,))
     z = jax.random.normal(jax.random.fold_in(key, channel), (len(draws), n), dtype=jnp.float64)
     prior, mean, covariances, draws, z = on_host((prior, mean, covariances, draws, z))
     residual_root, lower = prior.residual_root(channel), None

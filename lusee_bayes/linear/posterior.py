@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core import harmonics
+from lusee_bayes.core import harmonics, linalg
 from lusee_bayes.core.arrays import Array, ModesMatrix, Pixels, compiled, namespace
 from lusee_bayes.core.checks import Described, is_traced, number
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
 from lusee_bayes.sky.prior import Prior
 
 Degrees = Sequence[float] | Float[np.ndarray, " n"]
@@ -267,9 +266,9 @@ def _covariance(posterior: Posterior) -> tuple[Float[Array, "unknowns unknowns"]
     """C, and :func:`_rounding` in its diagonal."""
     xp, rank = namespace(posterior), posterior.prior.size
     if posterior.basis is None:
-        white = inverse_from_cholesky(posterior.lower)
+        white = linalg.inverse_from_cholesky(posterior.lower)
     else:
-        half = solve_lower(posterior.lower, posterior.basis.T, transpose=False)
+        half = linalg.solve_lower(posterior.lower, posterior.basis.T, transpose=False)
         white = half.T @ half + xp.eye(rank) - posterior.basis @ posterior.basis.T
     # colouring overwrites
     rounding = _rounding(posterior, xp.diagonal(white))
@@ -285,7 +284,7 @@ def _times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array
 def _white_times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array, "n white"]:
     """L^-T z, or with a basis: z outside its span, L^-T Q^T z inside."""
     inside = z if posterior.basis is None else z @ posterior.basis
-    drawn = solve_lower(posterior.lower, inside.T, transpose=True).T
+    drawn = linalg.solve_lower(posterior.lower, inside.T, transpose=True).T
     return drawn if posterior.basis is None else z + (drawn - inside) @ posterior.basis.T
 
 

@@ -26,12 +26,11 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 from scipy import sparse
 
+from lusee_bayes.core import checks, sphere_grid
 from lusee_bayes.core.arrays import Ells, Modes, ModesMatrix, Vector
-from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import checked_cholesky, scaled
-from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, spectrum_basis
 from lusee_bayes.priors.surveys import Survey
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, EXTENDED_OBJECTS, PointSource, galaxy_map
@@ -93,7 +92,7 @@ class Band:
     """
 
     window: Ells
-    grid: SphereGrid
+    grid: sphere_grid.SphereGrid
     covariates: Float[np.ndarray, "points covariates"]
     cells: sparse.csr_array
 
@@ -101,7 +100,7 @@ class Band:
     def of(cls, window: Ells, frequency_mhz: float) -> Band:
         """Make the band of a window."""
         top = int(np.flatnonzero(window)[-1])
-        grid = SphereGrid.of(top, max((3 * top + 1) // 2, LEAST_BAND))
+        grid = sphere_grid.SphereGrid.of(top, max((3 * top + 1) // 2, LEAST_BAND))
         theta, phi = grid.directions()
         fwhm = float(np.hypot(RESOLUTION_DEG / _middle(window), FINEST_DEG))
         # the template, and the same sky nearly without absorption
@@ -155,7 +154,7 @@ def smoothed_log(frequency_mhz: float, fwhm_deg: float, theta: Vector, phi: Vect
     alm, mean_log = _template(frequency_mhz)
     alm = healpy.almxfl(alm, healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX))
     smooth = healpy.alm2map(alm, TEMPLATE_NSIDE, lmax=TEMPLATE_LMAX)
-    require_positive("the smoothed template", smooth)
+    checks.require_positive("the smoothed template", smooth)
     return np.log(healpy.get_interp_val(smooth, theta, phi)) - mean_log
 
 

@@ -29,9 +29,8 @@ from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.times import later
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
-from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
+from lusee_bayes.runs import cost, plan_run
 from lusee_bayes.runs.folder import RunKind, inputs_of, run_folder
-from lusee_bayes.runs.plan_run import expected_inference
 from lusee_bayes.systematics.context import Setup
 
 
@@ -80,7 +79,7 @@ def run_simulate(
             "give -o a name that ends in .fits"
         )
     channels = (scenario,) if scenario.single else scenario.channels()
-    require_fits(simulation_cost(scenario, len(channels)), scenario)
+    cost.require_fits(cost.simulation_cost(scenario, len(channels)), scenario)
     setups = [set_up(channel, stages=stages) for channel in channels]
     with stages("noise"):
         data = [simulate(setup) for setup in setups]
@@ -396,7 +395,7 @@ def run_average(
             coarse = averaged(fine, to_s)
     if information:
         require_fitting(fine, scenario)
-        require_resources(scenario, fine, stages)
+        cost.require_resources(scenario, fine, stages)
     coarse.write(path)
     if not information:
         return Averages(fine, coarse, None)
@@ -407,4 +406,4 @@ def run_average(
 
 
 def _bits(scenario: Scenario, data: Visibilities) -> float:
-    return float(expected_inference(set_up(scenario, data)).posterior.information_bits())
+    return float(plan_run.expected_inference(set_up(scenario, data)).posterior.information_bits())

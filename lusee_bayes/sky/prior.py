@@ -21,12 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core import linalg
+from lusee_bayes.core import layouts, linalg
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import Described, extent, is_traced, require_array, require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import LARGEST_LMAX, per_mode
-from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.reading import read_text, reading
 
 Unknowns = Float[Array, " unknowns"]
@@ -367,11 +366,11 @@ class HarmonicPrior(DiagonalPrior):
             raise InputError(wrong)
 
 
-SPECTRUM = Layout(
+SPECTRUM = layouts.Layout(
     "text file of ell and C_ell in K^2",
     {
-        "ell": Variable(("line",), "integer", low=0.0, grows=True),
-        "C_ell": Variable(("line",), low=0.0),
+        "ell": layouts.Variable(("line",), "integer", low=0.0, grows=True),
+        "C_ell": layouts.Variable(("line",), low=0.0),
     },
 )
 

@@ -21,8 +21,7 @@ from jaxtyping import Bool, Float
 
 from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes, ModesMatrix
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.source import BeamSource, Receiver
+from lusee_bayes.instrument.beams import fields, source
 from lusee_bayes.instrument.coupling import CouplingMatrix, Instrument
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
@@ -118,15 +117,15 @@ class Setup:
     scenario: Any
     observation: Observation
     sky: Sky
-    beam_source: BeamSource
-    expected_source: BeamSource
-    beams: ProductBeams
+    beam_source: source.BeamSource
+    expected_source: source.BeamSource
+    beams: fields.ProductBeams
     coupling: CouplingMatrix
     prior: Prior
     responses: tuple[Grid, ...]
     background: Grid
     signal: Grid | None = None
-    receiver: Receiver | None = None
+    receiver: source.Receiver | None = None
     calibration: Calibration | None = None
     measured: bool = False
     family: PriorFamily | None = None

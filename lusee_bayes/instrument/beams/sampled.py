@@ -31,10 +31,8 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Complex, Float, Inexact
 
-from lusee_bayes.core import formats
-from lusee_bayes.core.checks import Described, listed, require_positive
+from lusee_bayes.core import checks, files, formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.layouts import Attribute, Kind, Layout, Variable
 from lusee_bayes.core.lazy import healpy, pyuvdata
 from lusee_bayes.core.reading import naming, reading, require_file
@@ -173,7 +171,7 @@ def _axes(theta: np.ndarray, phi: np.ndarray) -> tuple[list[np.ndarray], list[np
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class SampledBeams(Described, BeamSource):
+class SampledBeams(checks.Described, BeamSource):
     """Fields of antennas, or beams of products, in directions of a grid or of HEALPix pixels.
 
     Create them from arrays with :func:`sampled_beams`.
@@ -213,7 +211,7 @@ class SampledBeams(Described, BeamSource):
     def description(self) -> tuple[str, ...]:
         kind = "E fields of" if self.products is None else "product beams of"
         scale = "K per K" if self.absolute else "normalised so that autos integrate to one"
-        frequencies = listed(tuple(f"{f:g}" for f in self.frequencies_mhz))
+        frequencies = checks.listed(tuple(f"{f:g}" for f in self.frequencies_mhz))
         at, where = self.directions, f"HEALPix pixels of NSIDE {self.directions.nside}"
         if at.theta is not None:
             where = f"{len(at.theta)} theta x {at.n_phi} phi"
@@ -319,7 +317,7 @@ def sampled_beams(
     arrays = {name: x[None] if alone else x for name, x in filled.items()}
     arrays |= {name: np.atleast_1d(np.asarray(x, dtype=float)) for name, x in grid.items()}
     arrays["frequency_mhz"] = np.atleast_1d(np.asarray(frequencies_mhz, dtype=float))
-    require_positive(f"{path}: frequency_mhz", arrays["frequency_mhz"])
+    checks.require_positive(f"{path}: frequency_mhz", arrays["frequency_mhz"])
     kind = "complex" if products is None else "real"
     given = layout(tuple(fields), bool(grid), kind).checked(path, arrays, {}).arrays
     some = given[next(iter(fields))]
@@ -366,7 +364,7 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
     InputError
         If the file is missing, damaged or of another kind, or not as declared.
     """
-    path = user_path(path)
+    path = files.user_path(path)
     if path.is_file() and formats.is_fits(path):
         read = partial(formats.read_fits, path, hint=HINT)
     else:
@@ -409,7 +407,7 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
     -------
     Path
     """
-    path, theta = user_path(path), beams.directions.theta
+    path, theta = files.user_path(path), beams.directions.theta
     arrays = {"frequency_mhz": beams.frequencies_mhz}
     said = {"format": formats.BEAMS, "absolute": int(beams.absolute)}
     if beams.products is None:
@@ -422,7 +420,7 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
     if theta is not None:
         arrays["theta_deg"], n = np.degrees(theta), beams.directions.n_phi
         arrays["phi_deg"] = 360.0 * np.arange(n) / n
-    with replacing(path) as partly:
+    with files.replacing(path) as partly:
         if path.suffix.lower() in (".fits", ".fit"):
             hdus = [fits.PrimaryHDU(header=fits.Header(list(said.items())))]
             hdus += [fits.ImageHDU(a.copy(), name=name) for name, a in arrays.items()]

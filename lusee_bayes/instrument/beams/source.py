@@ -22,10 +22,9 @@ from jaxtyping import Complex, Float
 from pydantic import BeforeValidator, Field
 from scipy.constants import Boltzmann
 
+from lusee_bayes.core import formats, layouts
 from lusee_bayes.core.arrays import Array, Values
 from lusee_bayes.core.errors import InputError, require_known
-from lusee_bayes.core.formats import read_fits
-from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.section import LARGEST, Positive, Section
 from lusee_bayes.instrument.beams import fields as beam_fields
 from lusee_bayes.instrument.products import N_ANTENNAS
@@ -34,11 +33,11 @@ Ohms = Complex[np.ndarray, "ports ports"]
 Lines = Float[np.ndarray, "lines products modes"]
 # matrices of the ports at every frequency
 LOADS, BY_PORTS = ("ZL_real", "ZL_imag"), ("freq", N_ANTENNAS, N_ANTENNAS)
-LOADS_LAYOUT = Layout(
+LOADS_LAYOUT = layouts.Layout(
     "loads ZL of four receivers, as in luseepy's four-port waterfalls",
     {
-        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
-        **dict.fromkeys(LOADS, Variable(BY_PORTS, unit="Ohm")),
+        "freq": layouts.Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        **dict.fromkeys(LOADS, layouts.Variable(BY_PORTS, unit="Ohm")),
     },
 )
 
@@ -198,7 +197,7 @@ def read_receiver(path: str | Path) -> MeasuredReceiver:
     InputError
         For a missing or damaged file, or one without such images.
     """
-    images = read_fits(path, LOADS_LAYOUT, "check beam.receiver").arrays
+    images = formats.read_fits(path, LOADS_LAYOUT, "check beam.receiver").arrays
     return receiver_of(path, images, "freq", *LOADS)
 
 
