@@ -29,15 +29,9 @@ Left = Int[np.ndarray, " left"]
 
 # why a spectrum is not used in a band; the first means that it is used
 REASONS = (
-    "used",
-    "saturated",
-    "no gain or no data",
-    "comb",
-    "too many channels flagged",
-    "burst",
-    "lacks a product of its bin",
-    "does not fit the map",
-)
+    "used", "saturated", "no gain or no data", "comb", "too many channels flagged", "burst",
+    "lacks a product of its bin", "does not fit the map",
+)  # fmt: skip
 USED, SATURATED, NO_DATA, COMB, TOO_MANY, BURST, PRODUCT, NO_FIT = range(len(REASONS))
 
 # clock of a session whose own clock a clock file corrects
