@@ -483,10 +483,9 @@ def test_what_one_process_compiles_the_next_one_finds(tmp_path):
 
 
 @pytest.mark.long
-def test_it_can_be_switched_off_and_do_without(tmp_path):
+def test_it_can_be_switched_off_and_do_without(write):
     assert compiled("off")[0] == "0\n"
     # a place that cannot be written to: programs are compiled anew, and nothing is said
-    blocked = tmp_path / "file"
-    blocked.write_text("not a folder")
+    blocked = write("not a folder", "file")
     assert compiled(blocked)[0] == "0\n"
     assert blocked.read_text() == "not a folder"

@@ -153,9 +153,8 @@ def test_sessions_without_a_number_are_refused(simulated, tmp_path, capsys):
     assert "NaN" in said and not out.exists()
 
 
-def test_info_of_several_files_names_the_bad_one_and_shows_the_others(simulated, tmp_path, capsys):
-    bad = tmp_path / "bad.h5"
-    bad.write_text("nothing")
+def test_info_of_several_files_names_the_bad_one_and_shows_the_others(simulated, write, capsys):
+    bad = write("nothing", "bad.h5")
     good = [simulated / "session_000.h5", simulated / "gains.nc"]
     assert run("info", good[0], bad, good[1]) == 2
     told = capsys.readouterr()

@@ -310,10 +310,9 @@ def model(coupling, offset, prior, noise, data=None):
 
 
 @pytest.mark.parametrize("program", ["sky_marginal", "prior_amplitude", "plated"])
-def test_programs_without_the_sky_get_their_maps_too(program, tmp_path):
-    out, own = tmp_path / "out", tmp_path / "plated.py"
-    own.write_text(PLATED)
-    given = own if program == "plated" else program
+def test_programs_without_the_sky_get_their_maps_too(program, tmp_path, write):
+    out = tmp_path / "out"
+    given = write(PLATED, "plated.py") if program == "plated" else program
     arguments = ["--model", given, "--draws", "150", "--warmup", "100", "--chains", "2"]
     assert run("sample", *SMALL, *arguments, "-q", "-o", out) == 0
     tree = read_datatree(out / "samples.nc")
