@@ -35,11 +35,6 @@ def pixel_covariance() -> np.ndarray:
     return sum(terms) / (4 * np.pi)
 
 
-@pytest.fixture(scope="module")
-def harmonic():
-    return lb.HarmonicPrior(jnp.asarray(SPECTRUM))
-
-
 def dense_covariance() -> np.ndarray:
     return random_covariance(np.random.default_rng(4), 16, scale=3.0)
 
@@ -101,12 +96,12 @@ def test_what_no_prior_is_is_refused():
     refuse("the prior mean has shape", harmonic, spectrum[:2], mean=MEAN)
 
 
-def test_pixels_of_an_isotropic_sky_are_those_of_the_addition_theorem(harmonic):
+def test_pixels_of_an_isotropic_sky_are_those_of_the_addition_theorem():
     rng, y = np.random.default_rng(3), pixel_matrix(NSIDE, LMAX)
     np.testing.assert_allclose(y * PER_MODE @ y.T, pixel_covariance(), atol=1e-14)
     a, d, variance = rng.normal(size=(24, 16)), rng.normal(size=24), rng.uniform(0.5, 2.0, 24)
-    noise = lb.DiagonalCovariance(jnp.asarray(variance))
-    found = lb.LinearGaussian(jnp.asarray(a), harmonic, noise).condition(jnp.asarray(d)).posterior
+    prior, noise = lb.HarmonicPrior(SPECTRUM), lb.DiagonalCovariance(jnp.asarray(variance))
+    found = lb.LinearGaussian(jnp.asarray(a), prior, noise).condition(jnp.asarray(d)).posterior
     # A Y^+ sees a sky of pixels; numbers of order one, and a posterior of condition below 1e3
     naive = posterior(a @ np.linalg.pinv(y), pixel_covariance(), np.diag(variance), d)
     np.testing.assert_allclose(y @ np.asarray(found.mean), naive.mean, atol=1e-12)
