@@ -189,14 +189,11 @@ def page_of(reduced, folder):
 def test_the_section_says_how_spectra_were_reduced(reduced, tmp_path):
     page = page_of(reduced, tmp_path)
     for told in (
-        "gains.nc (netCDF)",
-        "the centre of channel k is at k times 25 kHz",
-        "middle of integrations",
-        "polynomial of degree 2 over 1 MHz",
-        "longitude 182.258°, latitude -23.814°, of the sessions",
-        "0x307",
+        "gains.nc (netCDF)", "the centre of channel k is at k times 25 kHz",
+        "middle of integrations", "polynomial of degree 2 over 1 MHz",
+        "longitude 182.258°, latitude -23.814°, of the sessions", "0x307",
         "UTC, from the clock file",
-    ):
+    ):  # fmt: skip
         assert told in page, told
 
 
