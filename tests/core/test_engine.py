@@ -37,12 +37,15 @@ def tree(parts):
     return parts[0]
 
 
+def joined(a, b):
+    return f"({a}+{b})"
+
+
 @pytest.mark.parametrize(("n", "side_by_side"), [(1, 2), (2, 1), (3, 2), (7, 5), (12, 2)])
 def test_results_come_in_order_and_merge_as_a_tree(n, side_by_side):
     found, stages = engine.ThisProcess(side_by_side), Stages()
     assert found.each(tasks_of(lambda k: k * k, n), stages, "s") == [k * k for k in range(n)]
-    whole = found.reduced(tasks_of(str, n), lambda a, b: f"({a}+{b})", stages, "sum")
-    assert whole == tree([*map(str, range(n))])
+    assert found.reduced(tasks_of(str, n), joined, stages, "sum") == tree([*map(str, range(n))])
     assert [*stages.seconds] == ["s", "sum"]
 
 
