@@ -37,10 +37,9 @@ from astropy.io import fits
 from astropy.time import Time
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core import checks, files, formats
+from lusee_bayes.core import checks, files, formats, reading
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument import products, times
 from lusee_bayes.instrument.beams import source
@@ -143,7 +142,7 @@ class Waterfall(checks.Described):
                 f"{self.path} has the product {label}, but the beams have {n_ports} ports; give "
                 "beam.rotations_deg an angle for every port"
             )
-        with naming(f"{self.path} at {frequency_mhz:g} MHz"):
+        with reading.naming(f"{self.path} at {frequency_mhz:g} MHz"):
             layout = products.DataLayout.from_flags(~present[within])
         data, mhz = layout.gather(values[within]), float(self.frequencies_mhz[channel])
         return Visibilities(data, layout, self.observation, mhz, receiver=self.receiver)
@@ -255,7 +254,7 @@ def read_scalar(path: Path) -> Waterfall:
         raise InputError(
             f"{path}: data has {data.shape[1]} products, expected {len(columns)} by combinations"
         )
-    with naming(path):
+    with reading.naming(path):
         said, values = content.values, np.moveaxis(data, 1, 0)
         signed = zip(columns, values, strict=True)
         grid = products.in_order([(label, sign * one) for (label, sign), one in signed])
@@ -320,7 +319,7 @@ def read_four_port(path: Path) -> Waterfall:
     scales = {p.label: root[:, p.i] * root[:, p.j] for p in products.all_products()}
     names = [str(label).strip() for label in images["products.label"]]
     named = zip(names, np.moveaxis(images["data"], 1, 0), strict=True)
-    with naming(path):
+    with reading.naming(path):
         grid = products.in_order([(name, volts / scales.get(name, 1.0)) for name, volts in named])
         scale = times.scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
         observation = _observation(times.utc_of(*images["time"].T, scale), said)
@@ -345,7 +344,7 @@ def read_waterfall(path: str | Path) -> Waterfall:
     InputError
         If there is no file, or as :func:`read_scalar` and :func:`read_four_port`.
     """
-    path = require_file(path, "data")
+    path = reading.require_file(path, "data")
     names = set(formats.image_names(path))
     return read_four_port(path) if "blackbody_normalization_real" in names else read_scalar(path)
 

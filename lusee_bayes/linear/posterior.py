@@ -15,9 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core import harmonics, linalg
+from lusee_bayes.core import checks, harmonics, linalg
 from lusee_bayes.core.arrays import Array, ModesMatrix, Pixels, compiled, namespace
-from lusee_bayes.core.checks import Described, is_traced, number
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sky.prior import Prior
@@ -28,7 +27,7 @@ Degrees = Sequence[float] | Float[np.ndarray, " n"]
 PRECISION = 1e-3
 
 
-class Posterior(Described, eqx.Module):
+class Posterior(checks.Described, eqx.Module):
     """N(mean, C) over the sky's unknowns m = G u, in K.
 
     Attributes
@@ -58,8 +57,8 @@ class Posterior(Described, eqx.Module):
         form = "map" if self.basis is None else "data"
         return (
             f"{self.prior.size} unknowns of the sky, in K, {form}-space form",
-            f"ln evidence {number(self.log_evidence)}, "
-            f"{number(self.information_bits(), '.1f')} bits of information",
+            f"ln evidence {checks.number(self.log_evidence)}, "
+            f"{checks.number(self.information_bits(), '.1f')} bits of information",
             "mean, std(), covariance(), sample(key, n), prior_fraction()",
         )
 
@@ -228,7 +227,7 @@ class Posterior(Described, eqx.Module):
 
 def _checked(errors: Float[Array, "..."], rounding: Float[Array, ""]) -> Float[Array, "..."]:
     """Standard deviations or covariance, unless rounding makes them wrong by too much."""
-    if not is_traced(rounding) and float(rounding) > PRECISION:
+    if not checks.is_traced(rounding) and float(rounding) > PRECISION:
         raise InputError(
             f"rounding would make standard deviations wrong by {rounding:.1g} (accepted: "
             f"{PRECISION:g}): the data are too precise for normal equations; use form=InData"

@@ -33,9 +33,8 @@ from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import checked_cholesky, scaled
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, spectrum_basis
 from lusee_bayes.priors.surveys import Survey
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, EXTENDED_OBJECTS, PointSource, galaxy_map
+from lusee_bayes.sky import galaxy, sky_source
 from lusee_bayes.sky.prior import PIVOT, DensePrior
-from lusee_bayes.sky.sky_source import galaxy_sky
 
 # arrays that recur
 Covariates = Float[np.ndarray, " covariates"]
@@ -145,7 +144,7 @@ def _middle(window: Ells) -> float:
 @lru_cache(maxsize=4)
 def _template(frequency_mhz: float) -> tuple[Complex[np.ndarray, " alms"], float]:
     """The embedded diffuse sky, without random structure, in K, and the mean of its logarithm."""
-    pixels = galaxy_map(frequency_mhz, TEMPLATE_NSIDE, seed=None)
+    pixels = galaxy.galaxy_map(frequency_mhz, TEMPLATE_NSIDE, seed=None)
     return healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3), float(np.log(pixels).mean())
 
 
@@ -351,7 +350,7 @@ class LocalScalesMember(Member):
 def embedded_local_scales(
     frequency_mhz: float,
     lmax: int,
-    sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
+    sources: tuple[galaxy.PointSource, ...] = galaxy.BRIGHT_SOURCES,
     surveys: Sequence[Survey] = (),
 ) -> LocalScales:
     """Make the family whose template is the embedded diffuse sky, or the mean of surveys.
@@ -365,10 +364,10 @@ def embedded_local_scales(
     surveys : sequence of Survey
         At this frequency, with the same lmax.
     """
-    mean = np.asarray(galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)
+    mean = np.asarray(sky_source.galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)
     constant, level = np.arange(len(mean)) == 0, mean[0] / np.sqrt(4.0 * np.pi)
     # these may be brighter or darker than their surroundings
-    extended = [level * one.strength * one.modes(lmax) for one in EXTENDED_OBJECTS]
+    extended = [level * one.strength * one.modes(lmax) for one in galaxy.EXTENDED_OBJECTS]
     scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * mean * constant, []
     discs = DISC_WIDTH * level * _discs(lmax).T
     if surveys:

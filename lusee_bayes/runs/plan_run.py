@@ -19,11 +19,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import files, linalg, reading
+from lusee_bayes.core import files, linalg, progress, reading
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import sum_over_m
-from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment import rounds, validity
 from lusee_bayes.experiment.instrument_sections import RunSection
 from lusee_bayes.experiment.model import model_about, set_up
@@ -128,7 +127,7 @@ def forecast(variation: Variation) -> Forecast:
 
 
 def variations_of(
-    sources: Sequence[str], overrides: Sequence[str], vary: Sequence[str], stages: Stages
+    sources: Sequence[str], overrides: Sequence[str], vary: Sequence[str], stages: progress.Stages
 ) -> list[Variation]:
     """List the variations to forecast: every scenario as it is, then its variations.
 
@@ -270,7 +269,7 @@ def kept_forecast(folder: Path, variation: Variation) -> Forecast:
 
 
 def forecasts_of(
-    variations: Sequence[Variation], folder: Path, engine: Engine, stages: Stages
+    variations: Sequence[Variation], folder: Path, engine: Engine, stages: progress.Stages
 ) -> list[Forecast]:
     """Make a forecast of every variation; duplicates are computed once.
 
@@ -323,7 +322,7 @@ def run_plan(
     *,
     engine: Engine | None = None,
     replace: bool = False,
-    stages: Stages | None = None,
+    stages: progress.Stages | None = None,
 ) -> RunOutcome[list[Forecast]]:
     """Forecast the information in every variation, and write table and figure in one transaction.
 
@@ -346,7 +345,7 @@ def run_plan(
         With the variation's name, if its scenario is invalid, or its forecast does not fit into
         memory.
     """
-    engine, stages = engine or ThisProcess(), stages or Stages()
+    engine, stages = engine or ThisProcess(), stages or progress.Stages()
     scenarios = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
     for name, scenario in scenarios.items():
         with reading.naming(name):
