@@ -17,9 +17,8 @@ from layout_4 import write_layout_4
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import reduce_files
 from lusee_bayes.flight import gain_model, reduced, session_files
+from lusee_bayes.instrument import visibilities, waterfalls
 from lusee_bayes.instrument.beams.sampled import read_beam, sampled_beams, write_sampled_beams
-from lusee_bayes.instrument.visibilities import read_visibilities
-from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
 from lusee_bayes.report.pages import write_report
 from lusee_bayes.results.finished_runs import read_channels, read_information, read_runs
@@ -45,9 +44,9 @@ def read_spectra(path: Path) -> object:
 LMAX_2 = small_scenario(lmax=2)
 # of files, named in words, beside their description
 READ = {
-    "visibilities.nc windows.nc": [read_visibilities],
-    "waterfall.fits": [read_waterfall, lambda path: lb.read_data(path, LMAX_2)],
-    "four_port.fits": [read_waterfall],
+    "visibilities.nc windows.nc": [visibilities.read_visibilities],
+    "waterfall.fits": [waterfalls.read_waterfall, lambda path: lb.read_data(path, LMAX_2)],
+    "four_port.fits": [waterfalls.read_waterfall],
     "scalar_beam.fits response.fits": [lambda path: read_beam(path).beams(10.0, 2)],
     "sampled_fields.nc sampled_fields.fits": [lambda path: read_beam(path).beams(25.0, 2)],
     "sampled_products.nc": [lambda path: read_beam(path).beams(25.0, 2)],
@@ -77,7 +76,7 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     experiment.data.write(folder / "visibilities.nc")
     experiment.data.stamped("start").write(folder / "windows.nc")
     channels = [replace(experiment.data, frequency_mhz=f) for f in (20.0, 25.0)]
-    write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
+    waterfalls.write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
     theta, phi = np.linspace(0.0, 90.0, 7), np.arange(0.0, 360.0, 45.0)
     fields = np.ones((4, 7, 8), dtype=complex)
     sampled = sampled_beams(25.0, e_theta=fields, e_phi=fields, theta_deg=theta, phi_deg=phi)

@@ -13,9 +13,8 @@ from astropy.io import fits
 from reference import tangents, unit_vectors, vectors
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.beams import sampled
+from lusee_bayes.instrument.beams import monopoles, sampled
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings
-from lusee_bayes.instrument.beams.monopoles import Monopoles, wavenumber
 from lusee_bayes.instrument.products import labels, to_real
 from lusee_bayes.report.describe import describe
 from lusee_bayes.testing import check_beam_source, small_scenario
@@ -67,7 +66,7 @@ KINDS = {
 
 @cache
 def embedded(kind, frequency_mhz=FREQUENCY):
-    return KINDS[kind](Monopoles(), frequency_mhz)
+    return KINDS[kind](monopoles.Monopoles(), frequency_mhz)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -75,7 +74,7 @@ def test_short_dipoles_have_their_closed_form(kind):
     """Dipoles u at places r: B_ij = (u.v - (u.n)(v.n)) / 2 exp(i k n.(r_i - r_j)), no angles."""
     rng = np.random.default_rng(2)
     arms, places = rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
-    k = wavenumber(FREQUENCY)
+    k = monopoles.wavenumber(FREQUENCY)
 
     class Dipoles:
         def towards(self, _, theta, phi):
@@ -259,10 +258,10 @@ def uvbeam(coordinates: str):
     options |= {"feed_version": "1", "model_version": "1"}
     if coordinates == "healpix":
         options |= {"nside": NSIDE}
-        given = [on_pixels(Monopoles(), f) for f in (20.0, 30.0)]
+        given = [on_pixels(monopoles.Monopoles(), f) for f in (20.0, 30.0)]
     else:
         options |= {"axis1_array": np.radians(PHI_DEG), "axis2_array": np.radians(THETA_DEG)}
-        given = [on_grid(Monopoles(), f) for f in (20.0, 30.0)]
+        given = [on_grid(monopoles.Monopoles(), f) for f in (20.0, 30.0)]
     # (vector: along phi, along theta; feed; frequency; directions)
     along = [[one[name][:2] for one in given] for name in ("e_phi", "e_theta")]
     options["data_array"] = np.stack([np.stack(one, axis=1) for one in along])
