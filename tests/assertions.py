@@ -43,6 +43,17 @@ def within(got: object, expected: object, atol: object) -> None:
     np.testing.assert_allclose(got, expected, rtol=0, atol=atol)
 
 
+def assert_same(got: object, expected: object, *names: str) -> None:
+    """Assert that these attributes are the same arrays."""
+    for name in names:
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name), name)
+
+
+def failed(found: object) -> set[str]:
+    """The checks that draws have not passed."""
+    return {check.name for check in found.checks if not check.passed}
+
+
 def require_conventions(path: Path) -> None:
     """Assert that a file follows CF: its name for it, units that are some, and grids of pixels."""
     with xr.open_datatree(path, engine="h5netcdf", decode_cf=False) as tree:

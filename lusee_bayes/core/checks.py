@@ -118,10 +118,7 @@ def require_finite(name: str, array: Any) -> None:
     InputError
         If an entry is not finite; the message lists the first such entries.
     """
-    if is_traced(array):
-        return
-    bad = ~np.isfinite(np.asarray(array))
-    if bad.any():
+    if not is_traced(array) and (bad := ~np.isfinite(np.asarray(array))).any():
         wrong = f"{name}: NaN or infinity ({_first_offenders(bad)}); flag missing samples instead"
         raise InputError(wrong)
 

@@ -176,11 +176,16 @@ def synthesis_matrix(theta: Angles, phi: Angles, lmax: int) -> AtPoints:
     return matrix
 
 
+def harmonics_at(lon_deg: float | Angles, lat_deg: float | Angles, lmax: int) -> AtPoints:
+    """The harmonics at places in degrees, one row for each."""
+    theta = np.radians(90.0 - np.atleast_1d(lat_deg))
+    return synthesis_matrix(theta, np.radians(np.atleast_1d(lon_deg)), lmax)
+
+
 def pixel_matrix(nside: int, lmax: int) -> Float[np.ndarray, "pixels modes"]:
     """Return :func:`synthesis_matrix` at the centres of HEALPix RING pixels."""
     require_nside(nside)
-    theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
-    return synthesis_matrix(theta, phi, lmax)
+    return synthesis_matrix(*healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside))), lmax)
 
 
 # what the Gaussian beam that drawn maps are smoothed with leaves of ell = lmax

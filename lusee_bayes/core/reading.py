@@ -22,9 +22,8 @@ from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML, YAMLError
 from ruamel.yaml.constructor import SafeConstructor
 
+from lusee_bayes.core import files, layouts
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import user_path
-from lusee_bayes.core.layouts import Content, Layout, Unloaded
 
 T = TypeVar("T")
 # no person and no part of this package writes a larger text file
@@ -51,7 +50,7 @@ def require_file(path: str | Path, what: str, hint: str = "") -> Path:
     InputError
         If there is none, it is a folder, a pipe or a device, or the user may not read it.
     """
-    path = user_path(path)
+    path = files.user_path(path)
     try:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -166,7 +165,7 @@ def read_model(path: str | Path, kind: type[T], what: str, hint: str = "") -> T:
         raise InputError(wrong) from error
 
 
-def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np.ndarray]:
+def read_table(path: str | Path, layout: layouts.Layout, hint: str = "") -> dict[str, np.ndarray]:
     """Read a CSV table with a header: columns by name, as numbers if all entries are numbers.
 
     Raises
@@ -194,7 +193,7 @@ def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np
     return columns | layout.checked(path, columns, {}).arrays
 
 
-def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
+def read_arrays(path: str | Path, layout: layouts.Layout, hint: str = "") -> layouts.Content:
     """Read arrays from NumPy's .npz.
 
     Raises
@@ -213,12 +212,12 @@ def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
         return layout.checked(path, {name: _unloaded(arrays, name) for name in arrays.files}, {})
 
 
-def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:
+def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> layouts.Unloaded:
     """The unread array, with shape and dtype from its header."""
     with arrays.zip.open(f"{name}.npy") as file:
         major, _ = np.lib.format.read_magic(file)
         header = getattr(np.lib.format, f"read_array_header_{major}_0")(file)
-    return Unloaded(header[0], header[2], partial(arrays.__getitem__, name))
+    return layouts.Unloaded(header[0], header[2], partial(arrays.__getitem__, name))
 
 
 class _Constructor(SafeConstructor):

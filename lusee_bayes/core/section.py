@@ -47,15 +47,8 @@ Treatment = Literal["marginalised", "sampled", "ignored"]
 
 # entries that name files; an entry with its default value does not
 FILES = (
-    "clock",
-    "file",
-    "gain_table",
-    "lines",
-    "mask_file",
-    "mean_file",
-    "schedule",
-    "spectrum_file",
-)
+    "clock", "file", "gain_table", "lines", "mask_file", "mean_file", "schedule", "spectrum_file",
+)  # fmt: skip
 
 
 def _described(schema: dict[str, Any], section: type[BaseModel]) -> None:

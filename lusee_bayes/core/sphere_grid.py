@@ -11,9 +11,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import harmonics, linalg
+from lusee_bayes.core import checks, harmonics, linalg
 from lusee_bayes.core.arrays import Array, Fields, as_complex, namespace
-from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import special
 
@@ -93,7 +92,7 @@ class SphereGrid(eqx.Module):
             If the coefficients have another lmax.
         """
         batch = modes.shape[:-1]
-        require_shape("the coefficients", modes, (*batch, harmonics.n_modes(self.lmax)))
+        checks.require_shape("the coefficients", modes, (*batch, harmonics.n_modes(self.lmax)))
         xp, lmax = namespace(modes, self.legendre), self.lmax
         order, ell = np.mgrid[: lmax + 1, : lmax + 1]
         plus = np.where(ell >= order, ell * (ell + 1) + order, 0)
@@ -123,7 +122,7 @@ class SphereGrid(eqx.Module):
             If the values belong to another grid.
         """
         batch = field.shape[:-2]
-        require_shape("the field", field, (*batch, *self.shape))
+        checks.require_shape("the field", field, (*batch, *self.shape))
         xp, lmax = namespace(field, self.legendre), self.lmax
         weights = self.weights.reshape(*(1,) * len(batch), -1, 1)
         amplitude = xp.fft.rfft(field * weights, axis=-1)[..., : lmax + 1]
@@ -160,7 +159,7 @@ class SphereGrid(eqx.Module):
         InputError
             If the values belong to another grid.
         """
-        require_shape("the field", field, self.shape)
+        checks.require_shape("the field", field, self.shape)
         highest, table = self.lmax, np.asarray(self.legendre)
         lmax = highest if lmax is None else lmax
         square = lmax == highest

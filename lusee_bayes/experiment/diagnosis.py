@@ -660,9 +660,6 @@ def _noise_level(residuals: Residuals, data: Visibilities) -> Iterator[Proposal]
     pairs = (z[:, 1:] * z[:, :-1])[np.isfinite(z[:, 1:] * z[:, :-1])]
     if stands_out(least, len(groups)) or pairs.sum() > WHITE * np.sqrt(len(pairs)):
         return
-    yield Proposal(
-        f"the noise variance is {factor:.3g} times the assumed one",
-        f"multiply noise.radiometer.factor by {factor:.3g}",
-        ChiSquare(whole.degrees, whole.degrees),
-        of_noise=True,
-    )
+    words = f"the noise variance is {factor:.3g} times the assumed one"
+    remedy = f"multiply noise.radiometer.factor by {factor:.3g}"
+    yield Proposal(words, remedy, ChiSquare(whole.degrees, whole.degrees), of_noise=True)

@@ -14,9 +14,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from lusee_bayes.core.engine import in_threads, processors
+from lusee_bayes.core import engine, progress
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import gain_table_of, per_kelvin_of
 from lusee_bayes.experiment.model import set_up, true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario
@@ -160,9 +159,9 @@ class FlightSimulation:
         changes = changes[(changes > session.start) & (changes < session.stop)]
         ends = {*range(session.start, session.stop, BLOCK), session.stop, *changes.tolist()}
         blocks = [slice(a, b) for a, b in pairwise(sorted(ends))]
-        together = 2 * processors()
+        together = 2 * engine.processors()
         for k in range(0, len(blocks), together):
-            yield from in_threads(self._block, blocks[k : k + together])
+            yield from engine.in_threads(self._block, blocks[k : k + together])
 
     def _block(self, rows: slice) -> Float32[np.ndarray, "_ products bins"]:
         t = to_matrix(self._in_channels(self.visibilities[..., rows]))
@@ -201,7 +200,7 @@ def flight_of(scenario: Scenario) -> FlightSection:
     return scenario.flight or FlightSection()
 
 
-def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightSimulation:
+def simulate_flight(scenario: Scenario, stages: progress.Stages | None = None) -> FlightSimulation:
     """Simulate sessions of a scenario.
 
     Parameters
@@ -217,7 +216,7 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
         If the beams are not calibrated in volts, the scenario's samples or noise cannot be those of
         spectra, the gain table cannot be read, or a tone is in no bin.
     """
-    stages, flight = stages or Stages(), flight_of(scenario)
+    stages, flight = stages or progress.Stages(), flight_of(scenario)
     section = flight.simulated or FlightSimulatedSection()
     radiometer, step_s = scenario.noise.radiometer, scenario.observation.step_s
     if radiometer.duty_cycle != 1.0 or radiometer.log_factor_std is not None:
@@ -275,7 +274,7 @@ def spectra_observation(scenario: Scenario, window_s: float) -> Observation:
 
 
 def true_visibilities(
-    scenario: Scenario, observation: Observation, stages: Stages
+    scenario: Scenario, observation: Observation, stages: progress.Stages
 ) -> Float[np.ndarray, "frequencies products times"]:
     """Return visibilities of the scenario's sky with the true instrument, in V^2/Hz.
 

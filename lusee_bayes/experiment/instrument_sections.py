@@ -18,11 +18,9 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from lusee_bayes.core.section import Angle, Positive, Section, Temperature, kinds_of, one_of
-from lusee_bayes.instrument.beams.fields import Interpolation
-from lusee_bayes.instrument.beams.grid import read_beam_grid
+from lusee_bayes.instrument.beams import fields, grid, sampled
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
-from lusee_bayes.instrument.beams.sampled import beam_kind, read_sampled
 from lusee_bayes.instrument.beams.source import BeamSource, ReceiverSection
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run, read_schedule
@@ -150,7 +148,7 @@ class BaseBeamSection(Section):
 
     def of_file(self, file: str) -> Any:
         """The section for the beams in a file, with the settings that it shares with this one."""
-        kind = BEAM_SECTIONS[beam_kind(file)]
+        kind = BEAM_SECTIONS[sampled.beam_kind(file)]
         shared = set(kind.model_fields) - {"model", "file", "exact"}
         return kind(file=file, **self.model_dump(include=shared))
 
@@ -237,7 +235,7 @@ class _LuseepySection(_FileSection):
     """
 
     quadrature: Literal["exact", "luseepy"] = "exact"
-    interpolation: Interpolation = "linear"
+    interpolation: fields.Interpolation = "linear"
     moon_temperature_k: Temperature = 0.0
 
     def asked(self) -> dict[str, Any]:
@@ -320,7 +318,7 @@ class SampledBeamSection(_FileSection):
     def source(self) -> BeamSource:
         """The beams of the file."""
         asked = self.model_dump(exclude={"model", "file", "exact"})
-        return replace(read_sampled(self.file), **asked)
+        return replace(sampled.read_sampled(self.file), **asked)
 
 
 class GridBeamSection(ScalarBeamSection, ResponseSection, SampledBeamSection):
@@ -341,7 +339,7 @@ class GridBeamSection(ScalarBeamSection, ResponseSection, SampledBeamSection):
 
     def source(self) -> BeamSource:
         """The beams of all files, interpolated."""
-        return read_beam_grid(self.file, self.values, lambda file: self.of_file(file).source())
+        return grid.read_beam_grid(self.file, self.values, lambda file: self.of_file(file).source())
 
 
 BEAM_SECTIONS = kinds_of(
@@ -353,7 +351,7 @@ def _complete_beam(tree: dict[str, Any]) -> None:
     """Complete ``beam: {file: ...}`` without a model, as in older scenarios: the file decides."""
     file = tree.get("file")
     if (tree.get("model") or "monopole") == "monopole" and file is not None:
-        tree["model"] = beam_kind(file) if isinstance(file, str) else "luseepy"
+        tree["model"] = sampled.beam_kind(file) if isinstance(file, str) else "luseepy"
     if tree.get("model") not in ("response", "grid") and tree.get("receiver") == "jfet":
         del tree["receiver"]  # scenarios of version 0.1 contained the keys of all kinds
 

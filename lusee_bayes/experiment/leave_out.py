@@ -18,11 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core import checks, section
 from lusee_bayes.core.arrays import Grid, GridFlags, Vector
-from lusee_bayes.core.checks import counted
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.progress import Stages, memory_limit
-from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.rounds import rebuilds, settled
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports
@@ -226,7 +225,7 @@ def fitting(
     rules, stages = _Rules.of(data, false_alarm), stages or Stages()
     gone = nothing = np.zeros(rules.present.shape, dtype=bool)
     # if N couples times, it is also a matrix of all data
-    n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
+    n, across = data.layout.size, section.is_modelled(setup.scenario.noise.gain)
     if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
         return Fitting(nothing, NOT_JUDGED)
     groups, kept = (), ""
@@ -339,7 +338,7 @@ class _Rules:
         n_single, n = int(single[:, ~whole].sum()), gone.shape[1]
         parts = [f"{group.kind} {group.name}" for group in groups]
         parts += [f"{int(whole.sum())} of {n} times"] if whole.any() else []
-        parts += [counted(n_single, "single value")] if n_single else []
+        parts += [checks.counted(n_single, "single value")] if n_single else []
         if not parts:
             return ""
         named = " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]]))

@@ -14,10 +14,9 @@ from dataclasses import replace
 import jax
 import numpy as np
 
+from lusee_bayes.core import harmonics, progress
 from lusee_bayes.core.arrays import Grid, ModesMatrix, on_device, on_host
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling
@@ -43,7 +42,7 @@ SAME_SITE_DEG = 1e-3
 
 
 def set_up(
-    scenario: Scenario, data: Visibilities | None = None, stages: Stages | None = None
+    scenario: Scenario, data: Visibilities | None = None, stages: progress.Stages | None = None
 ) -> Setup:
     """Build everything that does not depend on the values of data.
 
@@ -61,7 +60,7 @@ def set_up(
         If the data have another frequency, site or number of ports, or times of unknown meaning, or
         if the scenario's receivers or ground need information that the beams lack.
     """
-    stages = stages or Stages()
+    stages = stages or progress.Stages()
     if data is not None:
         require_fitting(data, scenario)
     with stages("sky"):
@@ -126,7 +125,7 @@ def _coupling_above(setup: Setup, values: kinds.Truth) -> CouplingMatrix:
     top = scenario.noise.above_lmax.top(scenario.lmax)
     beams = setup.beam_source.beams(setup.frequency_mhz, top)
     coupling = CouplingMatrix.build(beams, Pointing.of(setup.observation, top), setup.layout)
-    sky = Sky(np.zeros(n_modes(top)), setup.frequency_mhz)
+    sky = Sky(np.zeros(harmonics.n_modes(top)), setup.frequency_mhz)
     whole = replace(setup, scenario=scenario, sky=sky, beams=beams, coupling=coupling, hidden=None)
     for cls, section in present(scenario):
         whole = cls.moved(section, whole, values)

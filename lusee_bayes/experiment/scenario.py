@@ -18,9 +18,8 @@ from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
+from lusee_bayes.core import files, reading
 from lusee_bayes.core.errors import InputError, nearest, require_known
-from lusee_bayes.core.files import user_path
-from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
 from lusee_bayes.core.section import Frequency, Section, Seed
 from lusee_bayes.experiment import instrument_sections, sky_sections
 from lusee_bayes.flight.recipe import FlightSection
@@ -48,7 +47,7 @@ def apply_override(tree: dict[str, Any], override: str) -> None:
         node = node[place]
         if not isinstance(node, dict | list):
             raise InputError(f"--set {override}: '{parent}' is a value, not a section")
-    node[_place(node, last, override)] = parse_yaml(text, f"--set {override}: the value")
+    node[_place(node, last, override)] = reading.parse_yaml(text, f"--set {override}: the value")
 
 
 def _place(node: dict[str, Any] | list[Any], key: str, override: str) -> int | str:
@@ -320,7 +319,7 @@ class Scenario(Section):
 
 
 # a run writes the same scenario into each of its files
-_as_yaml = lru_cache(maxsize=64)(lambda text: as_yaml(json.loads(text)))
+_as_yaml = lru_cache(maxsize=64)(lambda text: reading.as_yaml(json.loads(text)))
 
 
 def scenario_names() -> list[str]:
@@ -359,11 +358,11 @@ def _validate(tree: dict[Any, Any], source: str | Path) -> Scenario:
 
 
 def _read_yaml(source: str | Path) -> dict[Any, Any]:
-    names, path = scenario_names(), user_path(source)
+    names, path = scenario_names(), files.user_path(source)
     if os.path.isfile(path) or (os.path.exists(path) and str(source) not in names):
-        tree = read_yaml(path, "a scenario")
+        tree = reading.read_yaml(path, "a scenario")
     elif str(source) in names:
-        tree = parse_yaml(scenario_text(str(source)), str(source))
+        tree = reading.parse_yaml(scenario_text(str(source)), str(source))
     elif os.sep in str(source) or Path(source).suffix[1:2].isalpha():
         wrong = f"no scenario file at '{source}'; check the path, or name one of the package"
         raise InputError(wrong)

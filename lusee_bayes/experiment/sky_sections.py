@@ -15,17 +15,15 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core import checks, harmonics
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import modes_to_map, n_modes, per_mode
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, kinds_of, one_of, requires
 from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.priors.surveys import Survey
-from lusee_bayes.sky import sky_source
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, diffuse_brightness, galactic_share
+from lusee_bayes.sky import galaxy, sky_source
 from lusee_bayes.sky.positive_skies import PositiveSkies
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_spectrum
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
@@ -48,7 +46,7 @@ class GalaxySection(Section, sky_source.SkySource):
     sources: bool = True
 
     def at(self, frequency_mhz: float, lmax: int) -> sky_source.Sky:
-        sources = BRIGHT_SOURCES if self.sources else ()
+        sources = galaxy.BRIGHT_SOURCES if self.sources else ()
         return sky_source.galaxy_sky(frequency_mhz, lmax, seed=self.seed, sources=sources)
 
 
@@ -131,13 +129,13 @@ class SurveySection(Section):
         """
         file = require_file(self.file, "survey", "check prior.surveys")
         sky, unseen = sky_source.read_sky_file(file, self.dataset), None
-        beam = per_mode(healpy.gauss_beam(np.radians(self.beam_deg), lmax))
+        beam = harmonics.per_mode(healpy.gauss_beam(np.radians(self.beam_deg), lmax))
         if isinstance(sky, sky_source.SkyMap):
             gaps = sky.unseen
             if self.mask_file is not None:
                 path = require_file(self.mask_file, "mask", "check prior.surveys")
                 mask = sky_source.SkyMap.read(path)
-                require_shape(f"{self.mask_file}: the mask", mask.pixels, gaps.shape)
+                checks.require_shape(f"{self.mask_file}: the mask", mask.pixels, gaps.shape)
                 gaps = gaps | mask.unseen | (mask.pixels == 0.0)
             if gaps.all() or not sky.pixels[~gaps].mean() > 0.0:
                 raise InputError(
@@ -145,7 +143,7 @@ class SurveySection(Section):
                 )
             if gaps.any():
                 template = sky_source.galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
-                filled = modes_to_map(beam * template, healpy.npix2nside(gaps.size))
+                filled = harmonics.modes_to_map(beam * template, healpy.npix2nside(gaps.size))
                 filled *= sky.pixels[~gaps].mean() / filled[~gaps].mean()
                 # a sharp edge would be amplified where the beam is taken off
                 width = np.radians(max(self.beam_deg, EDGE_DEG))
@@ -295,7 +293,7 @@ class LocalScalesPriorSection(Section):
 
     def family(self, frequency_mhz: float, lmax: int) -> PriorFamily:
         """The family from which data select a prior, up to lmax."""
-        sources = BRIGHT_SOURCES if self.sources else ()
+        sources = galaxy.BRIGHT_SOURCES if self.sources else ()
         surveys = [one.at(frequency_mhz, lmax) for one in self.surveys]
         return embedded_local_scales(frequency_mhz, lmax, sources, surveys=surveys)
 
@@ -396,9 +394,10 @@ class SpectralSection(Section):
         highest = int(np.sqrt(MOST_UNKNOWNS / len(self.fields))) - 1
         if highest < lmax:
             raise InputError(
-                f"positive joint skies of lmax {lmax} have {len(self.fields) * n_modes(lmax)} "
-                f"unknowns, more than the {MOST_UNKNOWNS} of one solution; use lmax={highest}, "
-                "fewer spectral.fields, or spectral.model=components"
+                f"positive joint skies of lmax {lmax} have "
+                f"{len(self.fields) * harmonics.n_modes(lmax)} unknowns, more than the "
+                f"{MOST_UNKNOWNS} of one solution; use lmax={highest}, fewer spectral.fields, or "
+                "spectral.model=components"
             )
         return min(round(FINER * lmax), highest)
 
@@ -410,12 +409,12 @@ class SpectralSection(Section):
         InputError
             As in :meth:`lmax_of_fields`.
         """
-        catalogue = BRIGHT_SOURCES if self.sources else ()
+        catalogue = galaxy.BRIGHT_SOURCES if self.sources else ()
         modes = [[source.modes(f, lmax) for source in catalogue] for f in frequencies_mhz]
-        sources = np.reshape(modes, (len(modes), len(catalogue), n_modes(lmax)))
-        templates = [partial(diffuse_brightness, f) for f in frequencies_mhz]
+        sources = np.reshape(modes, (len(modes), len(catalogue), harmonics.n_modes(lmax)))
+        templates = [partial(galaxy.diffuse_brightness, f) for f in frequencies_mhz]
         options = self.model_dump(include={"reference_mhz", "turnover_mhz"})
-        options |= {"weight": galactic_share, "lmax_fields": self.lmax_of_fields(lmax)}
+        options |= {"weight": galaxy.galactic_share, "lmax_fields": self.lmax_of_fields(lmax)}
         skies = np.array(frequencies_mhz), templates, lmax, self.fields
         return PositiveSkies.of(*skies, sources=sources, **options)
 

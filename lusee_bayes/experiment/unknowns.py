@@ -40,8 +40,7 @@ from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, Shared, T
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.sky.galaxy import kelvin_steradian
-from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.systematics.gain_table import COMMON_GAIN
+from lusee_bayes.systematics import context, gain_table
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 from lusee_bayes.systematics.sources import PointSources
 from lusee_bayes.systematics.systematic import Expanded, Truth
@@ -386,8 +385,8 @@ class Unknowns:
             return None
         null = None if joint else self._null_direction(posterior, float(covariance[0, 0]))
         common = None
-        if COMMON_GAIN in self.names:
-            gain = self.parts[self.names.index(COMMON_GAIN)]
+        if gain_table.COMMON_GAIN in self.names:
+            gain = self.parts[self.names.index(gain_table.COMMON_GAIN)]
             common = float(np.sqrt(gain @ posterior.covariance @ gain))
         return UnknownsReport(rows.filter(UNKNOWN_COLUMNS), null, common)
 
@@ -505,7 +504,7 @@ def _alone(experiment: Experiment, inference: Inference, part: Expanded) -> pd.D
 TESTED = {"clock_s": 10.0, "turntable_deg": 0.1, "tilt_east_deg": 0.1, "tilt_north_deg": 0.1}
 
 
-def tested_offsets(setup: Setup) -> dict[str, float]:
+def tested_offsets(setup: context.Setup) -> dict[str, float]:
     """The steps of all tested offsets, by name."""
     n_runs = setup.observation.n_runs
     return {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
@@ -567,7 +566,7 @@ def _preferred(experiment: Experiment, result: Inference, values: dict[str, floa
     steps = tested_offsets(setup)
     centre = dict.fromkeys(steps, 0.0) | values
     offsets = PointingOffsets.of(shifted(setup, centre), steps, centre)
-    expanded = Expanded.at(offsets, base_model(setup), Around(sky=sky, values=centre))
+    expanded = Expanded.at(offsets, base_model(setup), context.Around(sky=sky, values=centre))
     per_unit, day = np.asarray(expanded.columns) / offsets.stds, setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)
     stretches = [(-1, -1, np.ones(len(day), dtype=bool))]

@@ -25,10 +25,9 @@ import numpy as np
 from astropy.time import Time
 from pydantic import Field
 
+from lusee_bayes.core import reading, section
 from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.reading import naming, read_model
-from lusee_bayes.core.section import Section
 from lusee_bayes.instrument import times
 
 DAY_S, MJD_ZERO = 86400.0, 2400000.5
@@ -38,18 +37,18 @@ SAME_S = 1e-3
 MOST_OFF = 1e-2
 
 
-class _Reading(Section):
+class _Reading(section.Section):
     clock_reference_raw_seconds: float
 
 
-class _Clocks(Section):
+class _Clocks(section.Section):
     """Readings of the clocks in luseepy's records at ``clock_reference_isot``."""
 
     spectrometer: _Reading
     dcb: _Reading | None = None
 
 
-class _ClockFile(Section):
+class _ClockFile(section.Section):
     """Contents of a clock file."""
 
     format_version: Literal[1]
@@ -135,13 +134,13 @@ def read_clock(path: str | Path) -> Clock:
         If it cannot be read, lacks an entry, has an unknown entry, or an invalid date or scale.
     """
     hint = "write luseepy's clock reference (format_version 1), see docs/howto/first_light.md"
-    file = read_model(path, _ClockFile, "a clock reference", hint)
+    file = reading.read_model(path, _ClockFile, "a clock reference", hint)
     if (file.stated_utc_isot is None) == (file.clocks is None):
         raise InputError(
             f"{path} needs either clocks, for sessions whose UTC is unknown, or stated_utc_isot, "
             "to correct the UTC stated in sessions; see docs/howto/first_light.md"
         )
-    with naming(path):
+    with reading.naming(path):
         scale = times.scale_of("time_scale", file.time_scale)
         time = times.time_of_text("clock_reference_isot", file.clock_reference_isot, scale)
         clock = Clock(str(path), float(time.jd1), float(time.jd2), scale, 0.0, file.rate)

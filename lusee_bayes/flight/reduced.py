@@ -17,10 +17,9 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
 from lusee_bayes.flight.gain_model import COUNTS, LEAD, LETTERS, PLACES, Curves
 from lusee_bayes.flight.session import FIRST_PORT, NO_LEVEL, PORTS, SECOND_PORT
-from lusee_bayes.instrument.averaging import binned
+from lusee_bayes.instrument import averaging, products
 from lusee_bayes.instrument.beams.fields import place_of
 from lusee_bayes.instrument.observation import Observation, runs_of
-from lusee_bayes.instrument.products import DataLayout, labels
 from lusee_bayes.instrument.times import Windows, utc_of
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 
@@ -29,15 +28,9 @@ Left = Int[np.ndarray, " left"]
 
 # why a spectrum is not used in a band; the first means that it is used
 REASONS = (
-    "used",
-    "saturated",
-    "no gain or no data",
-    "comb",
-    "too many channels flagged",
-    "burst",
-    "lacks a product of its bin",
-    "does not fit the map",
-)
+    "used", "saturated", "no gain or no data", "comb", "too many channels flagged", "burst",
+    "lacks a product of its bin", "does not fit the map",
+)  # fmt: skip
 USED, SATURATED, NO_DATA, COMB, TOO_MANY, BURST, PRODUCT, NO_FIT = range(len(REASONS))
 
 # clock of a session whose own clock a clock file corrects
@@ -120,7 +113,7 @@ class Reduced(Described):
     frequencies_mhz: Float[np.ndarray, " frequency"] = quantity(
         "MHz", checks={"low": 0.0, "grows": True, "unit": "MHz"}, stored="frequency"
     )
-    product: Shaped[np.ndarray, " product"] = quantity("", checks={"choices": labels()})
+    product: Shaped[np.ndarray, " product"] = quantity("", checks={"choices": products.labels()})
     values: Float[np.ndarray, "frequency product bin"] = in_volts(stored="visibility")
     before: Float32[np.ndarray, "frequency product bin"] = in_volts(stored="before_flags")
     lines: Float32[np.ndarray, "frequency spectrum"] = quantity(
@@ -284,10 +277,10 @@ class Reduced(Described):
         if self.average_s is None:
             observation = self.observation.select(keep)
         else:
-            observation = binned(self.observation, keep, self.bin_of, self.average_s)
+            observation = averaging.binned(self.observation, keep, self.bin_of, self.average_s)
         scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
-        layout = DataLayout.from_flags(~present[:, bins])
+        layout = products.DataLayout.from_flags(~present[:, bins])
         # whatever the gains, a run lasts while the turntable stands still
         angle = np.array(observation.turntable_deg)[observation.run]
         run, angles = runs_of(angle, observation.n_times)
@@ -359,8 +352,8 @@ def read_reduced(path: str | Path) -> Reduced:
     """
     with opened_tree(path, formats.REDUCED, "reduced spectra", HINT) as tree:
         read = from_tree(Reduced, tree, str(path))
-    if tuple(read.product) != labels():
-        raise InputError(f"{path} does not have the products {', '.join(labels())}")
+    if tuple(read.product) != products.labels():
+        raise InputError(f"{path} does not have the products {', '.join(products.labels())}")
     with reading.naming(path):
         require_shape("level", read.level, (None, PORTS))
         require_shape("curves", read.curves.gain, (*LEAD, None))

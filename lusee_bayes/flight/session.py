@@ -17,10 +17,9 @@ import h5py
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped
 
+from lusee_bayes.core import checks, formats
 from lusee_bayes.core.arrays import Rows
-from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.formats import opened
 from lusee_bayes.core.layouts import Attribute, Content, Unread, Variable
 from lusee_bayes.core.reading import reading
 from lusee_bayes.flight.clock import Clock
@@ -146,7 +145,7 @@ class Recorded:
 
 
 @dataclass(frozen=True, repr=False, eq=False, kw_only=True)
-class Session(Described, Recorded):
+class Session(checks.Described, Recorded):
     """A session; its spectra stay in the file.
 
     Attributes
@@ -225,7 +224,7 @@ class Session(Described, Recorded):
         """
         with reading(self.path, "a session") as path, ExitStack() as stack:
             if self.kind == "FITS":
-                cube = stack.enter_context(opened(path, "a session"))["SPECTRA"].section
+                cube = stack.enter_context(formats.opened(path, "a session"))["SPECTRA"].section
             else:
                 with h5py.File(path) as file:
                     cache = cache_for(file["spectra/data"].chunks)
@@ -243,7 +242,7 @@ class Session(Described, Recorded):
         length = " to ".join(f"{length:.6g}" for length in lengths)
         notch = "unknown" if self.notch is None else f"{int((self.notch > 0).sum())} with it"
         lacking = [name for name in TELEMETRY if name not in self.telemetry]
-        unused = [f"{name} ({counted(n, 'row')})" for name, n in self.unused.items()]
+        unused = [f"{name} ({checks.counted(n, 'row')})" for name, n in self.unused.items()]
         return (
             f"{self.n_rows} spectra of 16 products, {N_CHANNELS} channels, {self.kind} layout "
             f"{self.layout}, flight software {self.software}",

@@ -17,10 +17,9 @@ from astropy.io import fits
 from astropy.table import Column, Table
 from jaxtyping import Float, Float32, Int
 
+from lusee_bayes.core import files, formats
 from lusee_bayes.core.arrays import Rows
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import hdf5_file, is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO
 from lusee_bayes.flight.layout_3 import INTERPOLATED, UNKNOWN, session_of_fits, session_of_hdf5
@@ -47,8 +46,8 @@ def read_session(path: str | Path) -> Session:
         For a file that is missing, damaged, incomplete, or of another kind or version.
     """
     path = require_file(path, "a session")
-    if is_fits(path):
-        with opened(path, FITS) as hdus:
+    if formats.is_fits(path):
+        with formats.opened(path, FITS) as hdus:
             if _version_of(path, hdus[0].header.get("LAYOUTV")) == 4:
                 raise InputError(
                     f"{path} is of layout 4 in FITS, but this version reads layout 4 only in HDF5; "
@@ -58,7 +57,7 @@ def read_session(path: str | Path) -> Session:
     with reading(path, HDF5):
         if not h5py.is_hdf5(path):
             raise InputError(f"{path} is neither HDF5 nor FITS; expected a session of lusee.ingest")
-        require_readable_hdf5(path)
+        formats.require_readable_hdf5(path)
         with h5py.File(path) as file:
             version = _version_of(path, file.attrs.get("layout_version"))
             return (session_of_4 if version == 4 else session_of_hdf5)(path, file)
@@ -182,8 +181,8 @@ def write_session(
         If the blocks do not match the rows, or the file cannot be written.
     """
     write = {"hdf5": _write_session_hdf5, "fits": _write_session_fits}[kind]
-    path = user_path(path)
-    with replacing(path) as unfinished:
+    path = files.user_path(path)
+    with files.replacing(path) as unfinished:
         write(unfinished, rows, blocks)
     return path
 
@@ -230,7 +229,7 @@ CUBE = {
 
 
 def _write_session_hdf5(path: Path, rows: SessionRows, blocks: Blocks) -> None:
-    with hdf5_file(path) as target, h5py.File(target, "w") as file:
+    with formats.hdf5_file(path) as target, h5py.File(target, "w") as file:
         _write_all_but_spectra(file, rows)
         shape = (rows.n_rows, N_PRODUCTS, N_CHANNELS)
         cube = file.create_dataset("spectra/data", shape, "f4", chunks=(1, *shape[1:]), **PACKED)

@@ -18,9 +18,8 @@ from scipy.interpolate import CubicSpline
 from lusee_bayes.core.arrays import RowFlags, Vector
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError, refusing
-from lusee_bayes.flight import flags, session
+from lusee_bayes.flight import flags, recipe, session
 from lusee_bayes.flight.gain_model import LETTERS, NANO2, GainModel
-from lusee_bayes.flight.recipe import FlightSimulatedSection
 from lusee_bayes.instrument.products import to_matrix, to_real
 
 # spectra; counts before rounding; covariances of the antennas' voltages
@@ -223,7 +222,7 @@ class Disturbances:
         Phases of bursts at the ports, in radians.
     """
 
-    section: FlightSimulatedSection
+    section: recipe.FlightSimulatedSection
     level: Shaped[np.ndarray, "rows ports"]
     absent: Bool[np.ndarray, "rows products"]
     saturated: RowFlags
@@ -236,7 +235,7 @@ class Disturbances:
     @classmethod
     def drawn(
         cls,
-        section: FlightSimulatedSection,
+        section: recipe.FlightSimulatedSection,
         hours: Float[np.ndarray, " rows"],
         step_s: float,
         origin: session.BinOrigin,

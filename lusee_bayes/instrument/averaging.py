@@ -37,14 +37,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
+from lusee_bayes.core import checks, harmonics
 from lusee_bayes.core.arrays import Array, GridFlags, TimeFlags, Times
-from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import tilt_powers
+from lusee_bayes.instrument import products, visibilities
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.times import ROUNDING_S, Nodes, Numbers, Windows, later, seconds_from
-from lusee_bayes.instrument.visibilities import Visibilities
 
 # numbers of samples; ex and ey; u_j and G_j of the module's equations
 Samples, Tilts = Int[np.ndarray, " samples"], Float[np.ndarray, "nodes 2"]
@@ -119,7 +117,7 @@ def windowed(
     delta = delta - mean[sample]
     largest = float(np.abs(delta).max())
     n_moments = terms_of_exponential(lmax * largest, ROUNDING)
-    scaled, powers = delta / (largest or 1.0), tilt_powers(order)
+    scaled, powers = delta / (largest or 1.0), harmonics.tilt_powers(order)
     ex, ey = -tilt[:, 0], -tilt[:, 1]
     # the transpose of the exponential has the opposite sign
     e = weight[:, None] * np.stack([ex**a * ey**b / factorial(a + b) for a, b in powers], axis=1)
@@ -176,7 +174,7 @@ LONGEST_S = 30.0 * 86400.0
 LEAST_SHARE = 0.5
 
 
-def averaged(data: Visibilities, to_s: float) -> Visibilities:
+def averaged(data: visibilities.Visibilities, to_s: float) -> visibilities.Visibilities:
     """Average data over bins of a given length.
 
     Bins start with the first window of each run and end with the run. If samples do not fit (after
@@ -201,7 +199,7 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
         For instants, for bins that are shorter than the samples or longer than 30 days, and if no
         data remain.
     """
-    require_positive("the time to average over, in seconds,", to_s)
+    checks.require_positive("the time to average over, in seconds,", to_s)
     observation, live_s = data.observation, data.observation.live_s
     bin_of = bins_of(observation, to_s)
     kept, used = by_the_rule(np.asarray(data.layout.present), bin_of, live_s)
@@ -213,7 +211,7 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     weight = live_s[used] / np.bincount(bin_of_left, live_s[used])[bin_of_left]
     grid = np.asarray(data.layout.scatter(data.data))[:, used] * weight
     first = np.searchsorted(bin_of_left, np.arange(len(bins)))
-    layout = DataLayout.from_flags(~kept[:, bins])
+    layout = products.DataLayout.from_flags(~kept[:, bins])
     means = layout.gather(np.add.reduceat(grid, first, axis=1))
     seen, calibration = binned(observation, used, bin_of, to_s), data.calibration
     if calibration is not None:
@@ -225,7 +223,7 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     return replace(data, data=means, layout=layout, observation=seen, calibration=calibration)
 
 
-def product_live_s(data: Visibilities) -> float:
+def product_live_s(data: visibilities.Visibilities) -> float:
     """Return the live time of data in seconds, summed over products."""
     return float(data.observation.live_s[data.layout.time].sum())
 

@@ -31,9 +31,8 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 from lusee_bayes.core.arrays import Array, Times, Values, namespace
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.harmonics import Rotation
-from lusee_bayes.instrument.averaging import sufficient_nodes, terms_of_exponential, windowed
+from lusee_bayes.instrument import averaging, schedule
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.schedule import CYCLE_DAYS
 from lusee_bayes.instrument.times import Windows, later
 
 Tilts = Float[np.ndarray, "times 2"]
@@ -113,13 +112,13 @@ class Pointing(eqx.Module):
             raise InputError(f"the order of the tilt expansion must be 0, 1, ..., got {order}")
         windows = observation.windows
         longest = 0.0 if windows is None else float((windows.end_s - windows.start_s).max())
-        n = sufficient_nodes(lmax * FASTEST_TURN * longest / 2.0)
+        n = averaging.sufficient_nodes(lmax * FASTEST_TURN * longest / 2.0)
         instants, sample, weight = observation.at_nodes(n)
         mcmf = instants.mcmf_from_galactic
         pole_frame = mean_pole_frame(mcmf) if pole_frame is None else pole_frame
         azimuth, tilt = split(mcmf @ pole_frame.T)
         order = sufficient_order(tilt, lmax) if order is None else order
-        of_time = windowed(sample, weight, azimuth, tilt, order, lmax)
+        of_time = averaging.windowed(sample, weight, azimuth, tilt, order, lmax)
         starts = np.searchsorted(observation.run, np.arange(observation.n_runs + 1)).tolist()
         frames = pole_frame, Rotation.from_matrix(pole_frame, lmax), *_lander(observation, lmax)
         return cls(*of_time, *frames, run_starts=tuple(starts), order=order)
@@ -192,7 +191,7 @@ def sufficient_order(tilt: Tilts, lmax: int) -> int:
     This is the lowest n >= LEAST_ORDER with ``(lmax |tilt|)^(n+1) / (n+1)! < TILT_TOLERANCE``.
     """
     size = lmax * float(np.hypot(tilt[:, 0], tilt[:, 1]).max())
-    return max(terms_of_exponential(size, TILT_TOLERANCE) - 1, LEAST_ORDER)
+    return max(averaging.terms_of_exponential(size, TILT_TOLERANCE) - 1, LEAST_ORDER)
 
 
 # true time minus the data's at the first sample, in seconds, and its increase per day
@@ -203,7 +202,7 @@ SITE = ("lon_deg", "lat_deg")
 # these, and the turntable of every run, from East towards North
 OFFSETS = (*CLOCK, "turntable_deg", *SITE, *TILTS)
 # change of the azimuth phi per hour as the Moon turns, in radians
-TURN_PER_HOUR = -2.0 * np.pi / (CYCLE_DAYS * 24.0)
+TURN_PER_HOUR = -2.0 * np.pi / (schedule.CYCLE_DAYS * 24.0)
 
 
 def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:

@@ -29,10 +29,9 @@ import numpy as np
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 
+from lusee_bayes.core import checks, reading
 from lusee_bayes.core.arrays import Times
-from lusee_bayes.core.checks import Described, extent, require_finite, require_shape
 from lusee_bayes.core.errors import InputError, nearest, refusing, require_known
-from lusee_bayes.core.reading import naming
 
 Numbers, Nodes = Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]
 EPHEMERIS_YEARS = (1900, 2050)
@@ -195,7 +194,7 @@ def require_same_times(what: str, off_s: Times, omitted: str) -> None:
 
 
 @dataclass(frozen=True, repr=False)
-class Windows(Described):
+class Windows(checks.Described):
     """Start, end and live time of every piece of every sample.
 
     Attributes
@@ -220,13 +219,13 @@ class Windows(Described):
     live_s: Float[np.ndarray, " pieces"]
 
     def __post_init__(self):
-        require_shape("sample of the windows", self.sample, (None,))
+        checks.require_shape("sample of the windows", self.sample, (None,))
         if not counts_up(self.sample):
             why = "pieces of windows must count the samples 0, 1, ..., at least one piece for each"
             raise InputError(why)
         for name in ("start_s", "end_s", "live_s"):
-            require_shape(f"{name} of the windows", getattr(self, name), self.sample.shape)
-            require_finite(f"{name} of the windows", getattr(self, name))
+            checks.require_shape(f"{name} of the windows", getattr(self, name), self.sample.shape)
+            checks.require_finite(f"{name} of the windows", getattr(self, name))
         start, end, live = self.start_s, self.end_s, self.live_s
         early = (np.diff(self.sample) == 0) & (start[1:] < end[:-1] - ROUNDING_S)
         rules = (
@@ -255,7 +254,7 @@ class Windows(Described):
         live, bounds = self.live_per_sample_s, self.bounds_s
         share = live.sum() / (bounds[:, 1] - bounds[:, 0]).sum()
         pieces = f"{self.n_samples} windows in {len(self.sample)} pieces"
-        return (f"{pieces}, live for {extent(live, 's', 'g')}, {share:.1%} of the time",)
+        return (f"{pieces}, live for {checks.extent(live, 's', 'g')}, {share:.1%} of the time",)
 
     @property
     def n_samples(self) -> int:
@@ -474,7 +473,7 @@ def utc_bounds(bounds: Any, n_times: int) -> Time:
     bounds = bounds if isinstance(bounds, Time) else np.asarray(bounds)
     if bounds.shape != (n_times, 2):
         raise InputError(f"bounds have shape {bounds.shape}, expected ({n_times}, 2)")
-    with naming("bounds, row by row"):
+    with reading.naming("bounds, row by row"):
         return utc_times(bounds).reshape(n_times, 2)
 
 

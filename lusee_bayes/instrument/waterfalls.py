@@ -37,12 +37,9 @@ from astropy.io import fits
 from astropy.time import Time
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.checks import Described, extent, require_positive
+from lusee_bayes.core import checks, files, formats, reading
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import image_names, read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument import products, times
 from lusee_bayes.instrument.beams import source
@@ -60,7 +57,7 @@ SITE_AND_STEP = {
 
 
 @dataclass(frozen=True, repr=False)
-class Waterfall(Described):
+class Waterfall(checks.Described):
     """Visibilities of several frequencies.
 
     Attributes
@@ -104,7 +101,7 @@ class Waterfall(Described):
         )
         if self.per_kelvin is None:
             return lines
-        volts = extent(self.per_kelvin, "V^2/Hz")
+        volts = checks.extent(self.per_kelvin, "V^2/Hz")
         return *lines, f"1 K is {volts}; including emission of the Moon at {self.moon_k:.15g} K"
 
     def channel(self, frequency_mhz: float) -> int:
@@ -145,7 +142,7 @@ class Waterfall(Described):
                 f"{self.path} has the product {label}, but the beams have {n_ports} ports; give "
                 "beam.rotations_deg an angle for every port"
             )
-        with naming(f"{self.path} at {frequency_mhz:g} MHz"):
+        with reading.naming(f"{self.path} at {frequency_mhz:g} MHz"):
             layout = products.DataLayout.from_flags(~present[within])
         data, mhz = layout.gather(values[within]), float(self.frequencies_mhz[channel])
         return Visibilities(data, layout, self.observation, mhz, receiver=self.receiver)
@@ -247,7 +244,7 @@ def read_scalar(path: Path) -> Waterfall:
         For a truncated file, a missing image or header entry, columns that do not match the
         products, ports beyond 0..3, or a bad date.
     """
-    content = read_fits(path, SCALAR_WATERFALL)
+    content = formats.read_fits(path, SCALAR_WATERFALL)
     data, columns = content.arrays["data"], []
     for i, j in content.arrays["combinations"]:
         # V_ji is the conjugate of V_ij
@@ -257,7 +254,7 @@ def read_scalar(path: Path) -> Waterfall:
         raise InputError(
             f"{path}: data has {data.shape[1]} products, expected {len(columns)} by combinations"
         )
-    with naming(path):
+    with reading.naming(path):
         said, values = content.values, np.moveaxis(data, 1, 0)
         signed = zip(columns, values, strict=True)
         grid = products.in_order([(label, sign * one) for (label, sign), one in signed])
@@ -314,15 +311,15 @@ def read_four_port(path: Path) -> Waterfall:
         For a truncated file, a missing image or header entry, wrong shapes or a wrong unit, unknown
         products, or times that do not increase.
     """
-    content = read_fits(path, FOUR_PORT_WATERFALL)
+    content = formats.read_fits(path, FOUR_PORT_WATERFALL)
     images, said = content.arrays, content.values
     per_kelvin = images["blackbody_normalization_real"].diagonal(axis1=1, axis2=2)
-    require_positive(f"{path}: the diagonal of blackbody_normalization_real", per_kelvin)
+    checks.require_positive(f"{path}: the diagonal of blackbody_normalization_real", per_kelvin)
     root = np.sqrt(per_kelvin)
     scales = {p.label: root[:, p.i] * root[:, p.j] for p in products.all_products()}
     names = [str(label).strip() for label in images["products.label"]]
     named = zip(names, np.moveaxis(images["data"], 1, 0), strict=True)
-    with naming(path):
+    with reading.naming(path):
         grid = products.in_order([(name, volts / scales.get(name, 1.0)) for name, volts in named])
         scale = times.scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
         observation = _observation(times.utc_of(*images["time"].T, scale), said)
@@ -347,8 +344,8 @@ def read_waterfall(path: str | Path) -> Waterfall:
     InputError
         If there is no file, or as :func:`read_scalar` and :func:`read_four_port`.
     """
-    path = require_file(path, "data")
-    names = set(image_names(path))
+    path = reading.require_file(path, "data")
+    names = set(formats.image_names(path))
     return read_four_port(path) if "blackbody_normalization_real" in names else read_scalar(path)
 
 
@@ -389,7 +386,7 @@ def write_waterfall(
         angles other than 0, other than four ports, channels of different observations, fewer than
         two channels.
     """
-    path, first = user_path(path), channels[0].observation
+    path, first = files.user_path(path), channels[0].observation
     if len(channels) < 2:
         raise InputError(
             f"{path}: luseepy's reader needs at least two channels; give --frequencies, or {HINT}"
@@ -446,7 +443,7 @@ def _write(path: Path, hdus: list[Hdu], header: dict[str, Any], scenario: str | 
     if scenario is not None:
         image = np.frombuffer(scenario.encode(), dtype=np.uint8)
         written.append(fits.ImageHDU(image, name="scenario"))
-    with replacing(path) as partial:
+    with files.replacing(path) as partial:
         written.writeto(partial)
     return path
 
@@ -493,7 +490,7 @@ def write_four_port(
         For anything the layout cannot store: open ports, windows, turntable angles other than 0,
         other than four ports, channels of different observations.
     """
-    path, observation = user_path(path), channels[0].observation
+    path, observation = files.user_path(path), channels[0].observation
     if (receiver := circuits[0].receiver) is None:
         raise InputError(
             f"{path}: luseepy's four-port waterfalls include the loads of receivers, but the ports "

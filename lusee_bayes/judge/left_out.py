@@ -42,9 +42,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from lusee_bayes.core import linalg
+from lusee_bayes.core import engine, linalg
 from lusee_bayes.core.arrays import Grid, GridFlags, Square, Vector, on_host
-from lusee_bayes.core.engine import in_threads, once
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -299,17 +298,17 @@ class LeftOut:
             stretch = self._stretch(number) if number >= 0 else self._whole
             return {k: self.missed(groups[k], stretch) for k in batches[number]}
 
-        missed = ChainMap(*in_threads(leave_out, list(batches)))
+        missed = ChainMap(*engine.in_threads(leave_out, list(batches)))
         return [missed[k] for k in range(len(groups))]
 
-    @once
+    @engine.once
     def inverse_diagonal(self) -> Grid:
         """The diagonal of K^-1, in 1/K^2; NaN where it is lost in rounding."""
         if self._kept is not None:
             self._lost = np.einsum("tkm,tkm->tk", self._kept[0], self._kept[0])
         else:
             missing = np.unique(self._stretch_of[np.isnan(self._lost[:, 0])])
-            in_threads(self._stretch, missing.tolist())
+            engine.in_threads(self._stretch, missing.tolist())
         w = self._weights
         precision = w if w.ndim == 2 else np.diagonal(w, axis1=1, axis2=2)
         precision = np.where(precision > self._lost, precision - self._lost, np.nan)
@@ -429,7 +428,7 @@ class LeftOut:
         def fill(part: Int[np.ndarray, " n"]) -> None:
             half[part], sky[part] = self._halves(self._rows(span.few[part]))
 
-        in_threads(fill, pieces(len(span.few)))
+        engine.in_threads(fill, pieces(len(span.few)))
         return Stretch(times, half.swapaxes(0, 1), sky.swapaxes(0, 1), span.factors)
 
     def _span(self, times: Int[np.ndarray, " n"]) -> Span:
@@ -484,12 +483,12 @@ class LeftOut:
 
     # --- groups that are removed from Q -------------------------------------------------------
 
-    @once
+    @engine.once
     def _normal(self) -> Square:
         """Q."""
         return linalg.times_lower(self._lower, self._lower, transpose=True)
 
-    @once
+    @engine.once
     def _trace(self) -> float:
         """tr Q^-1 of the sky."""
         return self._trace_of_sky(self._lower.copy())

@@ -55,7 +55,7 @@ the sky give ln p(d | m, w) = ln p(d | m) + ln p(z | m, d) - ln N(z; 0, 1), i.e.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
@@ -236,13 +236,10 @@ class AmplitudesOfSky:
         misfit = gradient @ inner @ gradient + least @ (precision @ least - 2.0 * vector)
         misfit += beyond @ np.linalg.solve(one + precision, beyond) - expected @ expected
         log_det = np.linalg.slogdet(mixed)[1] - np.linalg.slogdet(one + precision)[1]
-        return replace(
-            information,
-            matrix=information.matrix + pull.T @ (0.5 * (weight + weight.T)) @ pull,
-            vector=information.vector - pull.T @ gradient,
-            misfit=np.asarray(information.misfit + misfit),
-            log_det=np.asarray(information.log_det + log_det),
-        )
+        matrix = information.matrix + pull.T @ (0.5 * (weight + weight.T)) @ pull
+        vector = information.vector - pull.T @ gradient
+        misfit, log_det = information.misfit + misfit, information.log_det + log_det
+        return information.altered(matrix=matrix, vector=vector, misfit=misfit, log_det=log_det)
 
 
 @dataclass(frozen=True)
@@ -272,14 +269,12 @@ class Shared:
         at = np.linalg.lstsq(self.root, self.mean, rcond=None)[0]
         weight, pulled = self.root.T @ inverse, self.pull.T @ inverse
         across, among = weight @ self.pull, (weight - self.root.T) @ self.root
-        return replace(
-            local,
-            matrix=np.block([[local.matrix + pulled @ self.pull, across.T], [across, among]]),
-            vector=np.concatenate([local.vector, self.root.T @ self.mean]),
-            reference=np.concatenate([sky, at]),
-            misfit=np.asarray(local.misfit - self.mean @ self.mean),
-            log_det=np.asarray(local.log_det + np.linalg.slogdet(self.covariance)[1]),
-        )
+        matrix = np.block([[local.matrix + pulled @ self.pull, across.T], [across, among]])
+        vector = np.concatenate([local.vector, self.root.T @ self.mean])
+        misfit, reference = local.misfit - self.mean @ self.mean, np.concatenate([sky, at])
+        log_det = local.log_det + np.linalg.slogdet(self.covariance)[1]
+        scalars = {"misfit": misfit, "log_det": log_det}
+        return local.altered(matrix=matrix, vector=vector, reference=reference, **scalars)
 
 
 def template_amplitudes(solution: Solution, templates: Float[Array, "data n"]) -> Amplitudes:
@@ -352,14 +347,11 @@ class Patterns(eqx.Module):
         whole = self.information
         across = solve_lower(self.lower, self.patterns @ whole.matrix, transpose=False)
         pull = solve_lower(self.lower, (self.patterns @ whole.vector)[:, None], transpose=False)
-        return replace(
-            whole,
-            matrix=whole.matrix - across.T @ across,
-            vector=whole.vector - across.T @ pull[:, 0],
-            reference=whole.reference - self.expected,
-            misfit=np.asarray(whole.misfit - (pull**2).sum()),
-            log_det=np.asarray(whole.log_det + 2.0 * np.log(np.diagonal(self.lower)).sum()),
-        )
+        matrix, vector = whole.matrix - across.T @ across, whole.vector - across.T @ pull[:, 0]
+        misfit, reference = whole.misfit - (pull**2).sum(), whole.reference - self.expected
+        log_det = whole.log_det + 2.0 * np.log(np.diagonal(self.lower)).sum()
+        scalars = {"misfit": misfit, "log_det": log_det}
+        return whole.altered(matrix=matrix, vector=vector, reference=reference, **scalars)
 
     def whole_skies(self, diffuse: Skies, z: Float[np.ndarray, "skies patterns"]) -> Skies:
         """Compute draws of m given draws of d, in K.

@@ -21,11 +21,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import linalg
+from lusee_bayes.core import checks, linalg, trees
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
-from lusee_bayes.core.checks import Described, number, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.trees import quantity
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import Prior
 
@@ -47,7 +45,7 @@ def unfinished(
     return (count < 1) | ((moved > 1e-3 * CONVERGENCE) & gains & (count < most))
 
 
-class Information(Described, eqx.Module):
+class Information(checks.Described, eqx.Module):
     """ln p(d | m) of some data as a function of the sky m; see the module's equations.
 
     Attributes
@@ -66,16 +64,17 @@ class Information(Described, eqx.Module):
         Number of data, as a float.
     """
 
-    matrix: ModesMatrix = quantity("K-2", "A^T N^-1 A")
-    vector: Modes = quantity("K-1", "A^T N^-1 (d - A reference)")
-    reference: Modes = quantity("K", "reference sky")
-    misfit: Float[Array, ""] = quantity("1", "chi2 at the reference sky")
-    log_det: Float[Array, ""] = quantity("1", "ln det N")
-    n_data: Float[Array, ""] = quantity("1", "number of data")
+    matrix: ModesMatrix = trees.quantity("K-2", "A^T N^-1 A")
+    vector: Modes = trees.quantity("K-1", "A^T N^-1 (d - A reference)")
+    reference: Modes = trees.quantity("K", "reference sky")
+    misfit: Float[Array, ""] = trees.quantity("1", "chi2 at the reference sky")
+    log_det: Float[Array, ""] = trees.quantity("1", "ln det N")
+    n_data: Float[Array, ""] = trees.quantity("1", "number of data")
 
     def description(self) -> tuple[str, ...]:
         return (
-            f"ln p(d | m) of {number(self.n_data, '.0f')} data, for {self.n_modes} sky modes, in K",
+            f"ln p(d | m) of {checks.number(self.n_data, '.0f')} data, for {self.n_modes} sky "
+            "modes, in K",
         )
 
     @property
@@ -101,7 +100,7 @@ class Information(Described, eqx.Module):
         InputError
             If ``sky`` has another length.
         """
-        require_shape("the sky", sky, (self.n_modes,))
+        checks.require_shape("the sky", sky, (self.n_modes,))
         shift = sky - self.reference
         pulled = self.matrix @ shift
         misfit = np.asarray(self.misfit - 2.0 * (self.vector @ shift) + shift @ pulled)
@@ -121,10 +120,10 @@ class Information(Described, eqx.Module):
             If it is for another number of modes.
         """
         what = "the sky of the other data (use one lmax and noise.above_lmax for all)"
-        require_shape(what, other.reference, (self.n_modes,))
+        checks.require_shape(what, other.reference, (self.n_modes,))
         moved = other.recentred(self.reference)
         names = ("matrix", "vector", "misfit", "log_det", "n_data")
-        return replace(self, **{n: np.asarray(getattr(self, n) + getattr(moved, n)) for n in names})
+        return self.altered(**{name: getattr(self, name) + getattr(moved, name) for name in names})
 
     def raised(self, factor: float) -> Information:
         """Information of the same data with N multiplied by a factor.
@@ -134,13 +133,12 @@ class Information(Described, eqx.Module):
         factor : float
             Of N, positive.
         """
-        return replace(
-            self,
-            matrix=self.matrix / factor,
-            vector=self.vector / factor,
-            misfit=np.asarray(self.misfit / factor),
-            log_det=np.asarray(self.log_det + self.n_data * np.log(factor)),
-        )
+        shares = {name: getattr(self, name) / factor for name in ("matrix", "vector", "misfit")}
+        return self.altered(**shares, log_det=self.log_det + self.n_data * np.log(factor))
+
+    def altered(self, **numbers: float | Array) -> Information:
+        """Return the information with these attributes, as NumPy arrays."""
+        return replace(self, **{name: np.asarray(value) for name, value in numbers.items()})
 
     def chi2(self, sky: Modes) -> Float[Array, ""]:
         """Compute ``chi^2 = |L^-1 (d - A m - offset)|^2`` of a sky.
@@ -342,7 +340,7 @@ def integrated_out(
         If ``variance`` has another length.
     """
     others = information.n_modes - n
-    require_shape("the variance", variance, (others,) * variance.ndim)
+    checks.require_shape("the variance", variance, (others,) * variance.ndim)
     mean = np.zeros(others) if mean is None else mean
     local = information.recentred(np.concatenate([information.reference[:n], mean]))
     inner, joined = local.matrix[n:, n:], np.c_[local.matrix[n:, :n], local.vector[n:]]

@@ -28,9 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core import linalg
+from lusee_bayes.core import checks, linalg
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Square, Vector, on_host
-from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.linear.information import Information, precision_root
 from lusee_bayes.linear.posterior import Posterior
@@ -66,8 +65,8 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
     n, lower = len(residual_root), residual_lower(information, residual_root)
     inverse = linalg.inverse_from_cholesky(lower)
     gradient = residual_root * information.vector[:n]
-    solved, log_det = inverse @ gradient, 2.0 * np.log(np.diagonal(lower)).sum()
-    matrix, vector = -inverse, solved / residual_root
+    solved, matrix = inverse @ gradient, -inverse
+    vector = solved / residual_root
     matrix[np.diag_indices_from(matrix)] += 1.0
     matrix = linalg.scaled(matrix, 1.0 / residual_root, overwrite=True)
     if information.n_modes > n:
@@ -76,13 +75,9 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
         among, seen = information.matrix[n:, n:] - kept @ across.T, kept / residual_root
         matrix = np.block([[matrix, seen.T], [seen, among]])
         vector = np.concatenate([vector, information.vector[n:] - across @ solved])
-    return replace(
-        information,
-        matrix=matrix,
-        vector=vector,
-        misfit=np.asarray(information.misfit - gradient @ solved),
-        log_det=np.asarray(information.log_det + log_det),
-    )
+    misfit = information.misfit - gradient @ solved
+    log_det = information.log_det + 2.0 * np.log(np.diagonal(lower)).sum()
+    return information.altered(matrix=matrix, vector=vector, misfit=misfit, log_det=log_det)
 
 
 def residual_lower(information: Information, residual_root: Modes) -> ModesMatrix:
@@ -394,7 +389,7 @@ def channel_sky(
     """
     n = n_modes(prior.lmax)
     shared = information.n_modes - n
-    require_shape("the mean of all unknowns", mean, (prior.n_components * n + shared,))
+    checks.require_shape("the mean of all unknowns", mean, (prior.n_components * n + shared,))
     z = jax.random.normal(jax.random.fold_in(key, channel), (len(draws), n), dtype=jnp.float64)
     prior, mean, covariances, draws, z = on_host((prior, mean, covariances, draws, z))
     residual_root, lower = prior.residual_root(channel), None

@@ -537,12 +537,8 @@ class InMap(Whitened):
     def _factorised(model):
         factor = model.noise.factor()
         whitened = factor.whiten(model.coupling.dense())
-        return (
-            factor,
-            whitened,
-            root_of_precision(model.prior.sandwich(gram_matrix(whitened))),
-            None,
-        )
+        lower = root_of_precision(model.prior.sandwich(gram_matrix(whitened)))
+        return factor, whitened, lower, None
 
     def seen(self, u):
         return self.whitened @ self.model.prior.colour(u)

@@ -25,10 +25,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from lusee_bayes.core import checks, harmonics, linalg
 from lusee_bayes.core.arrays import ModesMatrix, on_host
-from lusee_bayes.core.checks import require_shape
-from lusee_bayes.core.harmonics import Rotation, mode_numbers, modes_by_size_of_order
-from lusee_bayes.core.linalg import gram_matrix, mirrored, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
 from lusee_bayes.noise import covariance, time_blocks
 
@@ -105,7 +103,7 @@ def of_one_angle(
         f, beams = f.swapaxes(2, 3), beams.reshape(n, 1, -1, n)
     f = np.ascontiguousarray(f).reshape(len(f), *beams.shape[1:3], beams.shape[2])
     # degree and order of every mode, and whether it is a_l,-m
-    ell, m = (x[modes_by_size_of_order(n - 1)] for x in mode_numbers(n - 1))
+    ell, m = (x[harmonics.modes_by_size_of_order(n - 1)] for x in harmonics.mode_numbers(n - 1))
     m, s = np.abs(m), (m < 0).astype(int)
     whole = np.zeros((len(m),) * 2)
     for order in range(n):
@@ -117,7 +115,7 @@ def of_one_angle(
 
 def places(lmax: int) -> Places:
     """Rows of the packed modes: by increasing ``|m|``, and for each the a_lm before the a_l,-m."""
-    return np.argsort(modes_by_size_of_order(lmax))
+    return np.argsort(harmonics.modes_by_size_of_order(lmax))
 
 
 def _rows_of_order(m: int, beams: Beams, f: Sums) -> Blocks:
@@ -166,7 +164,7 @@ def normal_matrix(
     InputError
         If their sizes differ, or N is not positive definite.
     """
-    require_shape("N", np.empty((noise.size, 0)), (coupling.shape[0], None))
+    checks.require_shape("N", np.empty((noise.size, 0)), (coupling.shape[0], None))
     factor = noise.factor() if factor is None else factor
     kind = NORMAL_MATRICES[type(noise)] if has_structure(coupling, noise) else _dense
     return kind(*on_host((coupling, noise, factor)))
@@ -211,7 +209,7 @@ def _base(noise: covariance.Covariance) -> covariance.Covariance:
 
 
 def _dense(coupling: Coupling, _: covariance.Covariance, factor: covariance.Factor) -> ModesMatrix:
-    return gram_matrix(np.asarray(factor.whiten(coupling.dense())))
+    return linalg.gram_matrix(np.asarray(factor.whiten(coupling.dense())))
 
 
 # inverses of blocks with a larger collinearity lose digits that whitened data keep
@@ -231,8 +229,8 @@ def _with_templates(
 ) -> ModesMatrix:
     """With N_0 + T T^T: A^T D A - V^T (1 + T^T D T)^-1 V, V = T^T D A, D = N_0^-1."""
     v = coupling.transpose_mv(np.asarray(factor.base.whiten_transpose(factor.v)))
-    solved = solve_lower(factor.lower, v.T, transpose=False)
-    return normal_matrix(coupling, noise.base, factor.base) - gram_matrix(solved)
+    solved = linalg.solve_lower(factor.lower, v.T, transpose=False)
+    return normal_matrix(coupling, noise.base, factor.base) - linalg.gram_matrix(solved)
 
 
 def summed(coupling: CouplingMatrix, weights: Float[np.ndarray, "..."]) -> ModesMatrix:
@@ -266,10 +264,10 @@ def summed(coupling: CouplingMatrix, weights: Float[np.ndarray, "..."]) -> Modes
         sums = weights[..., times], pointing.azimuth[times], pointing.functions[times].T
         total = total + of_one_angle(beams[group[0]], *sums, len(used))
     turn = pointing.pole_from_galactic
-    return _turned(turn, mirrored(total), places(len(turn.blocks) - 1))
+    return _turned(turn, linalg.mirrored(total), places(len(turn.blocks) - 1))
 
 
-def _turned(rotation: Rotation, matrix: ModesMatrix, place: Places) -> ModesMatrix:
+def _turned(rotation: harmonics.Rotation, matrix: ModesMatrix, place: Places) -> ModesMatrix:
     """R^T M R on and below the diagonal, degree by degree: the operands fit into a cache."""
     turned = np.empty_like(matrix)
     spans = [slice(ell**2, (ell + 1) ** 2) for ell in range(len(rotation.blocks))]
@@ -277,7 +275,7 @@ def _turned(rotation: Rotation, matrix: ModesMatrix, place: Places) -> ModesMatr
         rows = left.T @ matrix[place[span]].take(place[: span.stop], axis=1)
         for right, other in zip(rotation.blocks[: ell + 1], spans[: ell + 1], strict=True):
             turned[span, other] = rows[:, other] @ right
-    return mirrored(turned)
+    return linalg.mirrored(turned)
 
 
 # rows of A that enter one product, if N couples times
@@ -305,7 +303,7 @@ def _streamed(
         solved = factor.inverse[block] @ (a - factor.left[block] @ white[-window:])
         white = np.concatenate([white, solved])
         if len(white) >= window + STREAMED or block == n_blocks - 1:
-            total += gram_matrix(white[window:])
+            total += linalg.gram_matrix(white[window:])
             white = white[-window:]
     return _turned(pointing.pole_from_galactic, total, np.arange(n_modes))
 

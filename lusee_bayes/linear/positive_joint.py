@@ -400,15 +400,9 @@ def learn_laws(
         As :func:`.find_joint_mode`.
     """
     lmax = min(skies.lmax, COARSE_LMAX)
-    coarse = skies.coarser(lmax, lmax_fields)
-    parts = _large_scales(skies, channels, n_modes(lmax))
-    return find_joint_mode(coarse, FieldLaws.of(coarse), parts, learn=True, report=report).laws
+    coarse, n = skies.coarser(lmax, lmax_fields), n_modes(lmax)
 
-
-def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsInMemory:
-    """Information of all channels about the first modes."""
-
-    def large(channel: int, information: Information) -> Information:
+    def large_scales(channel: int, information: Information) -> Information:
         if information.n_modes == n:
             return information
         # small scales have the power of the template and its sources
@@ -416,4 +410,5 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
         power = power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0)
         return integrated_out(information, n, per_mode(power)[n:])
 
-    return ChannelsInMemory(tuple(channels.each(large)))
+    parts = ChannelsInMemory(tuple(channels.each(large_scales)))
+    return find_joint_mode(coarse, FieldLaws.of(coarse), parts, learn=True, report=report).laws

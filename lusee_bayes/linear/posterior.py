@@ -15,12 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core import harmonics
+from lusee_bayes.core import checks, harmonics, linalg
 from lusee_bayes.core.arrays import Array, ModesMatrix, Pixels, compiled, namespace
-from lusee_bayes.core.checks import Described, is_traced, number
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
 from lusee_bayes.sky.prior import Prior
 
 Degrees = Sequence[float] | Float[np.ndarray, " n"]
@@ -29,7 +27,7 @@ Degrees = Sequence[float] | Float[np.ndarray, " n"]
 PRECISION = 1e-3
 
 
-class Posterior(Described, eqx.Module):
+class Posterior(checks.Described, eqx.Module):
     """N(mean, C) over the sky's unknowns m = G u, in K.
 
     Attributes
@@ -59,8 +57,8 @@ class Posterior(Described, eqx.Module):
         form = "map" if self.basis is None else "data"
         return (
             f"{self.prior.size} unknowns of the sky, in K, {form}-space form",
-            f"ln evidence {number(self.log_evidence)}, "
-            f"{number(self.information_bits(), '.1f')} bits of information",
+            f"ln evidence {checks.number(self.log_evidence)}, "
+            f"{checks.number(self.information_bits(), '.1f')} bits of information",
             "mean, std(), covariance(), sample(key, n), prior_fraction()",
         )
 
@@ -82,9 +80,8 @@ class Posterior(Described, eqx.Module):
         (n, n) array
             In K^2.
         """
-        theta, phi = np.radians(90.0 - np.asarray(lat_deg)), np.radians(np.asarray(lon_deg))
         root = np.asarray(self.root())
-        rows = harmonics.synthesis_matrix(theta, phi, harmonics.lmax_of(len(root))) @ root
+        rows = harmonics.harmonics_at(lon_deg, lat_deg, harmonics.lmax_of(len(root))) @ root
         return rows @ rows.T
 
     def std(self) -> Float[Array, " unknowns"]:
@@ -230,7 +227,7 @@ class Posterior(Described, eqx.Module):
 
 def _checked(errors: Float[Array, "..."], rounding: Float[Array, ""]) -> Float[Array, "..."]:
     """Standard deviations or covariance, unless rounding makes them wrong by too much."""
-    if not is_traced(rounding) and float(rounding) > PRECISION:
+    if not checks.is_traced(rounding) and float(rounding) > PRECISION:
         raise InputError(
             f"rounding would make standard deviations wrong by {rounding:.1g} (accepted: "
             f"{PRECISION:g}): the data are too precise for normal equations; use form=InData"
@@ -268,9 +265,9 @@ def _covariance(posterior: Posterior) -> tuple[Float[Array, "unknowns unknowns"]
     """C, and :func:`_rounding` in its diagonal."""
     xp, rank = namespace(posterior), posterior.prior.size
     if posterior.basis is None:
-        white = inverse_from_cholesky(posterior.lower)
+        white = linalg.inverse_from_cholesky(posterior.lower)
     else:
-        half = solve_lower(posterior.lower, posterior.basis.T, transpose=False)
+        half = linalg.solve_lower(posterior.lower, posterior.basis.T, transpose=False)
         white = half.T @ half + xp.eye(rank) - posterior.basis @ posterior.basis.T
     # colouring overwrites
     rounding = _rounding(posterior, xp.diagonal(white))
@@ -286,7 +283,7 @@ def _times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array
 def _white_times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array, "n white"]:
     """L^-T z, or with a basis: z outside its span, L^-T Q^T z inside."""
     inside = z if posterior.basis is None else z @ posterior.basis
-    drawn = solve_lower(posterior.lower, inside.T, transpose=True).T
+    drawn = linalg.solve_lower(posterior.lower, inside.T, transpose=True).T
     return drawn if posterior.basis is None else z + (drawn - inside) @ posterior.basis.T
 
 

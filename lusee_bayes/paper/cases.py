@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from lusee_bayes.core import formats, reading
+from lusee_bayes.core import formats, reading, version
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.version import versions
 from lusee_bayes.experiment import model, sky_sections
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
@@ -102,7 +101,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
     attributes = {
         **formats.header(formats.PAPER_CASE),
         "scenario": scenario.to_yaml(),
-        "versions": json.dumps(versions()),
+        "versions": json.dumps(version.versions()),
         "frequency_mhz": scenario.frequency_mhz,
         **{name: getattr(channel, name) for name in NUMBERS},
         "n_modes": len(channel.mean),

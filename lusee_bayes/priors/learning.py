@@ -52,9 +52,8 @@ from lusee_bayes.core.arrays import Draws, ModesMatrix, Square
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError, refusing
 from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky
+from lusee_bayes.judge import measures, split
 from lusee_bayes.judge.chi2 import ChiSquare
-from lusee_bayes.judge.measures import expected_chi2
-from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily
@@ -321,7 +320,7 @@ def demanded_factor(information: Information, prior: Prior) -> float:
     try:
         posterior = information.posterior(prior)
         chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
-        left = Split.of(posterior, chi2, n_data).instrument
+        left = split.Split.of(posterior, chi2, n_data).instrument
     except InputError:  # the data are too far from any sky: rounding dominates these numbers
         left = ChiSquare(float(information.misfit), float(n_data))
     return 1.0 if left.too_small or left.fits else left.chi2 / left.degrees
@@ -335,7 +334,7 @@ def _fixed(family: PriorFamily, information: Information, factor: float) -> Lear
     """
     prior, n_data = family.expected(), int(information.n_data)
     raised = information.raised(factor).posterior(prior)
-    n_known = max(n_data - expected_chi2(raised, n_data), 1.0)
+    n_known = max(n_data - measures.expected_chi2(raised, n_data), 1.0)
     prior = prior.widened(max(1.0, float(np.sqrt(float(raised.prior_chi2()) / n_known))))
     for _ in range(MOST_WIDENINGS):
         try:

@@ -26,17 +26,15 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 from scipy import sparse
 
+from lusee_bayes.core import checks, sphere_grid
 from lusee_bayes.core.arrays import Ells, Modes, ModesMatrix, Vector
-from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import checked_cholesky, scaled
-from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, spectrum_basis
 from lusee_bayes.priors.surveys import Survey
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, EXTENDED_OBJECTS, PointSource, galaxy_map
+from lusee_bayes.sky import galaxy, sky_source
 from lusee_bayes.sky.prior import PIVOT, DensePrior
-from lusee_bayes.sky.sky_source import galaxy_sky
 
 # arrays that recur
 Covariates = Float[np.ndarray, " covariates"]
@@ -93,7 +91,7 @@ class Band:
     """
 
     window: Ells
-    grid: SphereGrid
+    grid: sphere_grid.SphereGrid
     covariates: Float[np.ndarray, "points covariates"]
     cells: sparse.csr_array
 
@@ -101,7 +99,7 @@ class Band:
     def of(cls, window: Ells, frequency_mhz: float) -> Band:
         """Make the band of a window."""
         top = int(np.flatnonzero(window)[-1])
-        grid = SphereGrid.of(top, max((3 * top + 1) // 2, LEAST_BAND))
+        grid = sphere_grid.SphereGrid.of(top, max((3 * top + 1) // 2, LEAST_BAND))
         theta, phi = grid.directions()
         fwhm = float(np.hypot(RESOLUTION_DEG / _middle(window), FINEST_DEG))
         # the template, and the same sky nearly without absorption
@@ -146,7 +144,7 @@ def _middle(window: Ells) -> float:
 @lru_cache(maxsize=4)
 def _template(frequency_mhz: float) -> tuple[Complex[np.ndarray, " alms"], float]:
     """The embedded diffuse sky, without random structure, in K, and the mean of its logarithm."""
-    pixels = galaxy_map(frequency_mhz, TEMPLATE_NSIDE, seed=None)
+    pixels = galaxy.galaxy_map(frequency_mhz, TEMPLATE_NSIDE, seed=None)
     return healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3), float(np.log(pixels).mean())
 
 
@@ -155,7 +153,7 @@ def smoothed_log(frequency_mhz: float, fwhm_deg: float, theta: Vector, phi: Vect
     alm, mean_log = _template(frequency_mhz)
     alm = healpy.almxfl(alm, healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX))
     smooth = healpy.alm2map(alm, TEMPLATE_NSIDE, lmax=TEMPLATE_LMAX)
-    require_positive("the smoothed template", smooth)
+    checks.require_positive("the smoothed template", smooth)
     return np.log(healpy.get_interp_val(smooth, theta, phi)) - mean_log
 
 
@@ -352,7 +350,7 @@ class LocalScalesMember(Member):
 def embedded_local_scales(
     frequency_mhz: float,
     lmax: int,
-    sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
+    sources: tuple[galaxy.PointSource, ...] = galaxy.BRIGHT_SOURCES,
     surveys: Sequence[Survey] = (),
 ) -> LocalScales:
     """Make the family whose template is the embedded diffuse sky, or the mean of surveys.
@@ -366,10 +364,10 @@ def embedded_local_scales(
     surveys : sequence of Survey
         At this frequency, with the same lmax.
     """
-    mean = np.asarray(galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)
+    mean = np.asarray(sky_source.galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)
     constant, level = np.arange(len(mean)) == 0, mean[0] / np.sqrt(4.0 * np.pi)
     # these may be brighter or darker than their surroundings
-    extended = [level * one.strength * one.modes(lmax) for one in EXTENDED_OBJECTS]
+    extended = [level * one.strength * one.modes(lmax) for one in galaxy.EXTENDED_OBJECTS]
     scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * mean * constant, []
     discs = DISC_WIDTH * level * _discs(lmax).T
     if surveys:

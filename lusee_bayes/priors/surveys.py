@@ -24,11 +24,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lusee_bayes.core import harmonics, sphere_grid
 from lusee_bayes.core.arrays import Modes, ModesMatrix
-from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, scaled, solve_lower
-from lusee_bayes.core.sphere_grid import SphereGrid
 
 # brightness of unseen parts of the sky, over the survey's mean
 BRIGHTEST = 10.0
@@ -113,8 +112,8 @@ class Survey:
         ]
 
     def _blind(self) -> ModesMatrix:
-        top = lmax_of(len(self.modes))
-        grid = SphereGrid.of(top, 2 * top)
+        top = harmonics.lmax_of(len(self.modes))
+        grid = sphere_grid.SphereGrid.of(top, 2 * top)
         near, _ = healpy.get_interp_weights(healpy.npix2nside(len(self.unseen)), *grid.directions())
         blind = self.unseen[near].any(axis=0).reshape(grid.shape)
         return grid.product_matrix(BRIGHTEST**2 * self.modes[0] ** 2 * blind)

@@ -11,12 +11,9 @@ from pkgutil import resolve_name
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import formats
+from lusee_bayes.core import files, formats, reading, trees
 from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import read_manifest, recover
-from lusee_bayes.core.reading import read_model, require_file
-from lusee_bayes.core.trees import from_tree, opened_tree
 
 
 def _has_image(*names: str) -> Callable[[Path], bool]:
@@ -53,7 +50,7 @@ HOLDS += ("posterior", "log_likelihood", "observed_data", "constant_data", "info
 def describe_diagnostics(path: Path) -> list[str]:
     """Describe the diagnostics of a map."""
     lines = []
-    with opened_tree(path, formats.DIAGNOSTICS, "diagnostics of lusee-bayes map") as tree:
+    with trees.opened_tree(path, formats.DIAGNOSTICS, "diagnostics of lusee-bayes map") as tree:
         for frequency, channel in sorted(tree.children.items(), key=lambda one: float(one[0])):
             lines.append(f"diagnostics of a map at {frequency} MHz")
             judged = channel.children.get("judged")
@@ -82,8 +79,8 @@ class _Skies:
 
 def describe_posterior(path: Path) -> list[str]:
     """Describe a posterior at one or several frequencies."""
-    with opened_tree(path, formats.POSTERIOR, "a posterior of lusee-bayes map") as tree:
-        skies = from_tree(_Skies, tree, str(path))
+    with trees.opened_tree(path, formats.POSTERIOR, "a posterior of lusee-bayes map") as tree:
+        skies = trees.from_tree(_Skies, tree, str(path))
         held = [name for name in HOLDS if name in tree.variables or name in tree.children]
         joint = "component_mean" in tree.variables
     if not skies.mean.size:
@@ -134,15 +131,14 @@ def describe_folder(folder: Path) -> list[str]:
     InputError
         If the folder is not that of a finished run.
     """
-    recover(folder)
-    manifest = read_manifest(folder)
+    files.recover(folder)
+    manifest = files.read_manifest(folder)
     if manifest is None:
         wrong = f"'{folder}' is not the folder of a run: no manifest.json; give a file or a folder"
         raise InputError(wrong)
     lines = [f"results of lusee-bayes {manifest['kind']}"]
-    provenance = "lusee_bayes.results.finished_runs:Provenance"
     if "provenance.json" in manifest["files"]:
-        facts = resolve_name(provenance).read(folder)
+        facts = resolve_name("lusee_bayes.results.finished_runs:Provenance").read(folder)
         lines += [
             f"data: {facts.data_line()}",
             f"{facts.first} to {facts.last} UTC, {facts.n_times} times, site {facts.lon_deg:g}, "
@@ -152,7 +148,7 @@ def describe_folder(folder: Path) -> list[str]:
         lines += [f"command: {facts.command}"] if facts.command else []
     for name in VERDICTS:
         if name in manifest["files"]:
-            figures = read_model(folder / name, dict, "the figures of a run")
+            figures = reading.read_model(folder / name, dict, "the figures of a run")
             lines.append(str(figures.get("verdict")))
     return [*lines, f"files: {', '.join(sorted(manifest['files']))}"]
 
@@ -191,7 +187,7 @@ def describe(path: str | Path) -> str:
     if Path(path).is_dir():
         lines = describe_folder(Path(path))
     else:
-        path = require_file(path, "file")
+        path = reading.require_file(path, "file")
         kind = formats.format_of(path) or ""
         if kind in DESCRIBED:
             lines = DESCRIBED[kind](path)

@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from lusee_bayes.core import files, harmonics, layouts
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import read_manifest, recover, replacing, require_files
-from lusee_bayes.core.harmonics import lmax_of, taper_fwhm_deg
-from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.reading import read_model, read_table
 from lusee_bayes.flight.reduced import REASONS, REDUCED, Reduced, read_reduced
 from lusee_bayes.judge.chi2 import ChiSquare, stands_out
@@ -57,7 +55,7 @@ def map_page(folder: Path, name: str) -> str:
         bad=[stands_out(channel.instrument.p, N_TESTS * len(channels)) for channel in channels],
         regions=_regions(run),
         viewer=viewer(name, channels),
-        smoothing_deg=taper_fwhm_deg(max(lmax_of(len(channels[0].mean)), 1)),
+        smoothing_deg=harmonics.taper_fwhm_deg(max(harmonics.lmax_of(len(channels[0].mean)), 1)),
         flight=flight_section(folder),
     )
 
@@ -123,16 +121,16 @@ def _band(reduced: Reduced, band: int, reasons: list[int]) -> dict[str, Any]:
 
 ROWS = ("quantity",)
 SUMMARY_COLUMNS = {
-    "quantity": Variable(ROWS, "text"),
-    **dict.fromkeys(("mean", "sd"), Variable(ROWS, finite=False)),
-    "r_hat": Variable(ROWS, missing=True),
+    "quantity": layouts.Variable(ROWS, "text"),
+    **dict.fromkeys(("mean", "sd"), layouts.Variable(ROWS, finite=False)),
+    "r_hat": layouts.Variable(ROWS, missing=True),
 }
-SUMMARY_TABLE = Layout("a summary of draws", SUMMARY_COLUMNS)
+SUMMARY_TABLE = layouts.Layout("a summary of draws", SUMMARY_COLUMNS)
 
 
 def sample_page(folder: Path, name: str) -> str:
     """The page of a sampled run as text, from its folder. InputError as :func:`.map_page`."""
-    require_files(folder, ("summary.csv", "sampling.json", "scenario.yaml"), "sample")
+    files.require_files(folder, ("summary.csv", "sampling.json", "scenario.yaml"), "sample")
     path, validation = folder / "sampling.json", folder / "validation.json"
     sampling = read_model(path, SamplingSummary, "the figures of a sampled run")
     quantities = read_table(folder / "summary.csv", SUMMARY_TABLE)
@@ -181,14 +179,14 @@ def write_report(folder: str | Path) -> Path:
         If the folder has no results of a kind with a page (``PAGES``).
     """
     folder = Path(folder)
-    require_files(folder, (), "map")
-    recover(folder)
-    manifest = read_manifest(folder)
+    files.require_files(folder, (), "map")
+    files.recover(folder)
+    manifest = files.read_manifest(folder)
     kind = manifest and manifest["kind"]
     if kind not in PAGES:
         wrong = f"'{folder}' has no results of map, sample or validate; give that of a finished run"
         raise InputError(wrong)
     path = folder / REPORT
-    with replacing(path) as partial:
+    with files.replacing(path) as partial:
         partial.write_text(PAGES[kind](folder, folder.resolve().name), encoding="utf-8")
     return path

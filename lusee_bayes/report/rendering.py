@@ -18,11 +18,9 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
-from lusee_bayes.core import checks, files
+from lusee_bayes.core import checks, files, version
 from lusee_bayes.core.reading import read_text
-from lusee_bayes.core.version import printable
-from lusee_bayes.judge.chi2 import HEADLINES, RULE, probability
-from lusee_bayes.judge.convergence import CRITERIA
+from lusee_bayes.judge import chi2, convergence
 from lusee_bayes.results.finished_runs import Provenance, text_hash
 
 # symbols as terminals write them, and as pages do
@@ -49,7 +47,7 @@ def render(template: str, folder: Path, **context: Any) -> str:
         If the template shows a picture that the folder lacks.
     """
     shown = {f.__name__: partial(f, folder) for f in (picture, pictures, has_picture)}
-    return printable(ENVIRONMENT.get_template(template).render(context | shown))
+    return version.printable(ENVIRONMENT.get_template(template).render(context | shown))
 
 
 def render_text(template: str, **context: Any) -> str:
@@ -99,7 +97,7 @@ def formatted(value: Any, form: str, missing: str = "") -> str:
 
 def p_value(p: float, missing: str = "") -> str:
     """Format a probability (:func:`.probability`) for a column; ``missing`` for NaN."""
-    return missing if p != p else probability(p).removeprefix("= ")
+    return missing if p != p else chi2.probability(p).removeprefix("= ")
 
 
 def typeset(value: Any) -> Any:
@@ -120,8 +118,8 @@ ENVIRONMENT = Environment(
     lstrip_blocks=True,
 )
 ENVIRONMENT.filters |= {"number": formatted, "probability": p_value}
-ENVIRONMENT.globals |= {"asset": asset, "counted": checks.counted, "CRITERIA": CRITERIA}
-ENVIRONMENT.globals |= {"RULE": RULE, "HEADLINES": HEADLINES}
+ENVIRONMENT.globals |= {"asset": asset, "counted": checks.counted, "CRITERIA": convergence.CRITERIA}
+ENVIRONMENT.globals |= {"RULE": chi2.RULE, "HEADLINES": chi2.HEADLINES}
 
 
 def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any) -> str:

@@ -30,9 +30,8 @@ from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.times import later
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
-from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
+from lusee_bayes.runs import cost, plan_run
 from lusee_bayes.runs.folder import RunKind, inputs_of, run_folder
-from lusee_bayes.runs.plan_run import expected_inference
 from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.gain_drifts import drift_within
 
@@ -82,7 +81,7 @@ def run_simulate(
             "give -o a name that ends in .fits"
         )
     channels = (scenario,) if scenario.single else scenario.channels()
-    require_fits(simulation_cost(scenario, len(channels)), scenario)
+    cost.require_fits(cost.simulation_cost(scenario, len(channels)), scenario)
     setups = [set_up(channel, stages=stages) for channel in channels]
     with stages("noise"):
         data = [simulate(setup) for setup in setups]
@@ -400,7 +399,7 @@ def run_average(
     if said := drift_within(scenario.noise.gain, coarse.observation):
         raise InputError(said)
     if information:
-        require_resources(scenario, fine, stages)
+        cost.require_resources(scenario, fine, stages)
     coarse.write(path)
     if not information:
         return Averages(fine, coarse, None)
@@ -412,4 +411,4 @@ def run_average(
 
 def _bits(scenario: Scenario, data: Visibilities) -> float:
     setup = observed(scenario.of_measured(), data).setup
-    return float(expected_inference(setup).posterior.information_bits())
+    return float(plan_run.expected_inference(setup).posterior.information_bits())

@@ -19,18 +19,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core import files, linalg, progress, reading
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing
 from lusee_bayes.core.harmonics import sum_over_m
-from lusee_bayes.core.linalg import invert_lower
-from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import naming, parse_yaml
+from lusee_bayes.experiment import rounds, validity
 from lusee_bayes.experiment.instrument_sections import RunSection
 from lusee_bayes.experiment.model import model_about, set_up
-from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.experiment.validity import NOTHING, blind_spots
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.measures import effective_resolution_deg, prior_fraction_per_ell
 from lusee_bayes.linear.posterior import Posterior
@@ -57,7 +53,7 @@ def informed_modes(posterior: Posterior) -> int:
     They are counted on the covariance of the whitened sky, whose eigenvalues lie between 0 and 1.
     On Lambda, whose largest eigenvalue is 1e13, rounding would blur the threshold.
     """
-    half = np.asarray(invert_lower(posterior.lower))
+    half = np.asarray(linalg.invert_lower(posterior.lower))
     return int((np.linalg.eigvalsh(half.T @ half) < 0.5).sum())
 
 
@@ -78,14 +74,14 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
     return setup.with_layout(DataLayout.from_flags(~np.asarray(layout.present) | dead[:, None]))
 
 
-def expected_inference(setup: Setup) -> Inference:
+def expected_inference(setup: Setup) -> rounds.Inference:
     """The model of a setup, and its posterior, which needs no data except for the mean.
 
     N is the model's, with marginalised systematics and noise levels from the modelled sky.
     """
     model, held = model_about(setup, Around())
     # the covariance does not depend on the data, so use zeros
-    return Inference(model.condition(np.zeros(model.n_data)), held, 1, Around())
+    return rounds.Inference(model.condition(np.zeros(model.n_data)), held, 1, Around())
 
 
 def turned(family: str) -> bool:
@@ -93,10 +89,10 @@ def turned(family: str) -> bool:
     return family in (AS_GIVEN, "turned, same time", "turned, more time") or "runs" in family
 
 
-def unnoticed(setup: Setup, inference: Inference) -> str:
+def unnoticed(setup: Setup, inference: rounds.Inference) -> str:
     """Errors that the residual chi^2 would not reveal, sorted by their effect on the map."""
-    spots = blind_spots(setup, inference, np.asarray(setup.sky.modes))
-    shown = [s for s in spots if s.shown > NOTHING * s.bias**2]
+    spots = validity.blind_spots(setup, inference, np.asarray(setup.sky.modes))
+    shown = [s for s in spots if s.shown > validity.NOTHING * s.bias**2]
     shown.sort(key=lambda s: -s.unnoticed[1])
     return ", ".join(f"{s.name} {s.unnoticed[0]:.2g}{s.unit} ({s.unnoticed[1]:.2g})" for s in shown)
 
@@ -109,7 +105,7 @@ def forecast(variation: Variation) -> Forecast:
     InputError
         With the variation's name, if its scenario is invalid.
     """
-    with naming(f"{variation.source}, {variation.name}"):
+    with reading.naming(f"{variation.source}, {variation.name}"):
         setup = set_up(variation.scenario)
         if variation.lost:
             setup = without_ports(setup, variation.lost)
@@ -131,7 +127,7 @@ def forecast(variation: Variation) -> Forecast:
 
 
 def variations_of(
-    sources: Sequence[str], overrides: Sequence[str], vary: Sequence[str], stages: Stages
+    sources: Sequence[str], overrides: Sequence[str], vary: Sequence[str], stages: progress.Stages
 ) -> list[Variation]:
     """List the variations to forecast: every scenario as it is, then its variations.
 
@@ -180,7 +176,7 @@ def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str])
     variations = [Variation(source, AS_GIVEN, AS_GIVEN, given)]
     for text in vary:
         key, _, listed = text.partition("=")
-        values = parse_yaml(f"[{listed}]", f"--vary {text}")
+        values = reading.parse_yaml(f"[{listed}]", f"--vary {text}")
         if not key or not isinstance(values, list) or not values:
             raise InputError(f"--vary expects key.path=value,value (as seed=1,2), got '{text}'")
         for value in values:
@@ -270,13 +266,13 @@ def kept_forecast(folder: Path, variation: Variation) -> Forecast:
     made = forecast(variation)
     kept = vars(made) | {"snr_squared": made.snr_squared.tolist()}
     del kept["variation"]
-    with replacing(path) as scratch:
+    with files.replacing(path) as scratch:
         scratch.write_text(json.dumps(kept), encoding="utf-8")
     return made
 
 
 def forecasts_of(
-    variations: Sequence[Variation], folder: Path, engine: Engine, stages: Stages
+    variations: Sequence[Variation], folder: Path, engine: Engine, stages: progress.Stages
 ) -> list[Forecast]:
     """Make a forecast of every variation; duplicates are computed once.
 
@@ -329,7 +325,7 @@ def run_plan(
     *,
     engine: Engine | None = None,
     replace: bool = False,
-    stages: Stages | None = None,
+    stages: progress.Stages | None = None,
 ) -> RunOutcome[list[Forecast]]:
     """Forecast the information in every variation, and write table and figure in one transaction.
 
@@ -352,10 +348,10 @@ def run_plan(
         With the variation's name, if its scenario is invalid, or its forecast does not fit into
         memory.
     """
-    engine, stages = engine or ThisProcess(), stages or Stages()
+    engine, stages = engine or ThisProcess(), stages or progress.Stages()
     scenarios = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
     for name, scenario in scenarios.items():
-        with naming(name):
+        with reading.naming(name):
             scenario.require_single("a forecast has")
             if scenario.observation.average_s is not None:
                 raise InputError("a plan does not average: set observation.step_s, window=mean")

@@ -18,12 +18,11 @@ import numpy as np
 import xarray as xr
 from numpyro.infer.hmc import HMCState
 
+from lusee_bayes.core import files, version
 from lusee_bayes.core.engine import Demand, Engine
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, reading
-from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.experiment import Experiment, infer, program_pieces, sampled_together
 from lusee_bayes.experiment.model import true_values
@@ -38,18 +37,15 @@ from lusee_bayes.results.finished_runs import Provenance, write_cubes, write_map
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, ValidationResult
 from lusee_bayes.runs.cost import demand_of, measured_experiment
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
-from lusee_bayes.sampling import programs
-from lusee_bayes.sampling.datatree import read_datatree, to_datatree
+from lusee_bayes.sampling import datatree, least, programs
 from lusee_bayes.sampling.distributions import Marginal, TimesStudentT
 from lusee_bayes.sampling.hmc import CHUNK, Chains, Checkpoints, Sampler, Whitening, sample
-from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program
 from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel, site_in
 from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
 from lusee_bayes.sky.spectral_prior import SpectralPrior
-from lusee_bayes.systematics.gain_drifts import SCALES
-from lusee_bayes.systematics.registered import present
+from lusee_bayes.systematics import gain_drifts, registered
 from lusee_bayes.systematics.systematic import SKY, Chart, Systematic, Unknown
 
 # number of starts of the search for the mode of a collapsed program
@@ -102,7 +98,7 @@ def sample_together(
         "program": program.name,
         "program text": program.digest,
         **{f"sampler's {name}": value for name, value in sampler.identity().items()},
-        "versions": versions(with_commit=False),
+        "versions": version.versions(with_commit=False),
         **({} if skies is None else {"skies": "joint"}),
     }
     if resume and not (folder / CHAINS).exists():
@@ -144,7 +140,7 @@ def sample_together(
         else:
             begin = [(name, start_values(one, latent[name])) for name, one in inferences.items()]
             start = {site_in(name, n): v for name, values in begin for n, v in values.items()}
-            fixed = [site_in(name, n) for name in latent for n in SCALES]
+            fixed = [site_in(name, n) for name in latent for n in gain_drifts.SCALES]
             mode = laplace_approximation(model, observed, start, fixed)
             whitening = mode.whitening if bool(mode.converged) else None
         if rounds is not None and whitening is not None:
@@ -179,7 +175,7 @@ def sample_together(
             given = drawn, program, inference.model, inference.posterior, one.data
             known = None if one.setup.measured else true_values(one.setup)
             more = {"arguments": arguments[name], "truth": known}
-            tree = to_datatree(*given, seed=sampler.seed, attributes=said, **more)
+            tree = datatree.to_datatree(*given, seed=sampler.seed, attributes=said, **more)
         results.append(SampleResult(one, inference, tree, stages.seconds, speed))
     return tuple(results)
 
@@ -195,7 +191,7 @@ def coordinates(
     start, arguments = start_values(inference, latent), {**arguments, "data": data.data}
     starts = 1 if SKY in latent else STARTS
     chart = _chart(arguments, latent)
-    mode = laplace_approximation(program.model, arguments, start, SCALES, starts, chart)
+    mode = laplace_approximation(program.model, arguments, start, gain_drifts.SCALES, starts, chart)
     return mode.whitening if bool(mode.converged) else None
 
 
@@ -242,7 +238,7 @@ def _finished(path: Path, identity: dict, sampler: Sampler) -> xr.DataTree | Non
     """Read the samples of a finished run; None without a file, InputError if settings differ."""
     if not path.exists():
         return None
-    tree = read_datatree(path)
+    tree = datatree.read_datatree(path)
     with reading(path, "samples"):
         same = json.loads(tree.attrs["identity"]) == json.loads(json.dumps(identity))
     if not same or tree["posterior"].sizes["draw"] != sampler.draws:
@@ -351,12 +347,12 @@ def run_sample(
             made = drawn or draw({"": channel}, run.path, stages)[0]
             return run.write(made, stages, Provenance.of_experiment(made.experiment, data))
 
-    folder, stages = user_path(folder), stages or Stages()
+    folder, stages = files.user_path(folder), stages or Stages()
     if scenario.single:
         made = one(scenario, folder, stages)
         return replace_fields(made, result=(made.result,))
     channels = {f"{one.frequency_mhz:.15g}MHz": one for one in scenario.channels()}
-    treated = present(scenario)
+    treated = registered.present(scenario)
     together = scenario.joint or any(
         k.octaves(one) for k, one in treated if k.treatment(scenario) == "sampled"
     )
@@ -474,8 +470,8 @@ def run_validate(
     sampler = sampler or Sampler(seed=scenario.seed)
     scenario.require_single("a validation has")
     program = programs.load_program("sky")
-    require_simulations(simulations)
-    require_draws(sampler.draws)
+    least.require_simulations(simulations)
+    least.require_draws(sampler.draws)
     given = {"replace": replace, **told(program, sampler)}
     with run_folder(folder, VALIDATION, scenario, data, program.path, **given) as run:
         n = sampler.chains * sampler.draws

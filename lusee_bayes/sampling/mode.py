@@ -36,7 +36,7 @@ from numpyro.infer.util import constrain_fn, potential_energy
 
 from lusee_bayes.core.arrays import Array, DataVector
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import lmax_of, pixel_matrix, power_spectrum, synthesis_matrix
+from lusee_bayes.core.harmonics import harmonics_at, lmax_of, pixel_matrix, power_spectrum
 from lusee_bayes.sampling.distributions import HALF_LOG_2PI, Prediction
 from lusee_bayes.sampling.hmc import Whitening, whitened
 from lusee_bayes.sampling.programs import DATA, WHITE_SUFFIX, Program, latent_of, numpyro_promotion
@@ -489,8 +489,7 @@ def sky_quantities(
     """
     lmax, columns = lmax_of(skies.shape[-1]), {}
     for name, (l_deg, b_deg) in (pixels or {}).items():
-        theta, phi = np.radians([90.0 - b_deg]), np.radians([l_deg])
-        columns[f"T({name}) [K]"] = skies @ synthesis_matrix(theta, phi, lmax)[0]
+        columns[f"T({name}) [K]"] = skies @ harmonics_at(l_deg, b_deg, lmax)[0]
     spectra = power_spectrum(skies) if len(ells) else None
     for ell in ells:
         if not 0 <= ell <= lmax:

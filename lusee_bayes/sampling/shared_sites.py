@@ -31,8 +31,7 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.linear.amplitudes import Amplitudes, kernel, tie
 from lusee_bayes.linear.joint_model import JointModel
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.sampling.hmc import Chains, Whitening
-from lusee_bayes.sampling.programs import DATA, numpyro_promotion
+from lusee_bayes.sampling import hmc, programs
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 from lusee_bayes.systematics.systematic import Unknown
 
@@ -47,11 +46,11 @@ def site_in(channel: str, name: str) -> str:
     return f"{channel}/{name}"
 
 
-def of_channel(chains: Chains, channel: str) -> Chains:
+def of_channel(chains: hmc.Chains, channel: str) -> hmc.Chains:
     """The draws of one channel, with site names without the channel."""
     start = site_in(channel, "")
     sites = {n.removeprefix(start): v for n, v in chains.sites.items() if n.startswith(start)}
-    return Chains(sites, chains.statistics)
+    return hmc.Chains(sites, chains.statistics)
 
 
 def gaussian_of_sites(
@@ -60,7 +59,7 @@ def gaussian_of_sites(
     frequencies_mhz: Mapping[str, float],
     octaves: Mapping[str, float],
     latent: Sequence[str],
-) -> Whitening:
+) -> hmc.Whitening:
     """Coordinates in which the Gaussian of sites, given the data of all channels, is N(0, 1).
 
     Parameters
@@ -95,7 +94,7 @@ def gaussian_of_sites(
     mean, root = (np.concatenate([np.asarray(part[k]) for part in parts]) for k in (0, 1))
     lower = np.linalg.cholesky(root @ root.T)
     log_det = np.asarray(np.log(np.diagonal(lower)).sum())
-    return Whitening(*map(jnp.asarray, (mean, lower, log_det)), tuple(sites))
+    return hmc.Whitening(*map(jnp.asarray, (mean, lower, log_det)), tuple(sites))
 
 
 @dataclass(frozen=True)
@@ -135,9 +134,9 @@ class SharedSites:
         """Combine the channels' models, as the program returns them."""
         return JointModel.of(models, list(data.values()), self.skies)
 
-    @numpyro_promotion()
+    @programs.numpyro_promotion()
     def drawn_skies(
-        self, channels: Mapping[str, dict], data: Mapping[str, Array], chains: Chains, seed: int
+        self, channels: Mapping[str, dict], data: Mapping[str, Array], chains: hmc.Chains, seed: int
     ) -> dict[str, np.ndarray]:
         """Draw every channel's sky given each draw of its sites, (chains, draws, modes), in K."""
 
@@ -168,7 +167,7 @@ class _Channel(Messenger):
             return
         name, prior = msg["name"], msg["fn"]
         msg["name"] = site_in(self.channel, name)
-        msg["stop"] = name == DATA and self.shared.skies is not None
+        msg["stop"] = name == programs.DATA and self.shared.skies is not None
         if msg["type"] != "sample" or name not in self.shared.octaves:
             return
         octaves, before = self.shared.octaves[name], self.site_values.setdefault(name, {})

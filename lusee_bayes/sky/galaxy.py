@@ -41,7 +41,7 @@ from scipy.constants import Boltzmann, speed_of_light
 from lusee_bayes.core.arrays import Vector
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import per_mode, require_nside, synthesis_matrix
+from lusee_bayes.core.harmonics import harmonics_at, per_mode, require_nside
 from lusee_bayes.core.lazy import coordinates, healpy
 
 Numbers = float | np.ndarray
@@ -251,9 +251,7 @@ class PointSource:
         (modes,) array
             Real packed coefficients, Galactic, in K.
         """
-        l_deg, b_deg = self.galactic()
-        theta, phi = np.array([np.radians(90.0 - b_deg)]), np.array([np.radians(l_deg)])
-        return self.kelvin_steradian(frequency_mhz) * synthesis_matrix(theta, phi, lmax)[0]
+        return self.kelvin_steradian(frequency_mhz) * harmonics_at(*self.galactic(), lmax)[0]
 
 
 @dataclass(frozen=True)
@@ -291,8 +289,7 @@ class ExtendedObject:
         profile = self.profile(polar) * np.sin(polar)
         zonal = np.polynomial.legendre.legvander(np.cos(polar), lmax).T @ profile
         zonal *= 2.0 * np.pi**2 / N_POLAR
-        theta, phi = np.radians([90.0 - self.b_deg]), np.radians([self.l_deg])
-        return per_mode(zonal) * synthesis_matrix(theta, phi, lmax)[0]
+        return per_mode(zonal) * harmonics_at(self.l_deg, self.b_deg, lmax)[0]
 
 
 # steps in the polar angle: exact to 1e-5 for widths of some degrees

@@ -28,10 +28,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core import checks, sphere_grid
 from lusee_bayes.core.arrays import Array, Vector
-from lusee_bayes.core.checks import require_positive, require_shape
 from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE
 from lusee_bayes.sky.prior import PIVOT
 from lusee_bayes.sky.spectral_prior import SpectralPrior, require_names
@@ -116,7 +115,7 @@ class PositiveSkies(eqx.Module):
 
     frequencies_mhz: Float[np.ndarray, " channels"]
     mixing: Float[np.ndarray, "channels fields"]
-    grid: SphereGrid
+    grid: sphere_grid.SphereGrid
     levels: Float[np.ndarray, "channels rings phi"]
     weight: Float[np.ndarray, "rings phi"]
     sources: Float[np.ndarray, "channels sources modes"]
@@ -170,13 +169,13 @@ class PositiveSkies(eqx.Module):
         frequencies = np.asarray(frequencies_mhz, dtype=np.float64)
         cls.require_fields(names, len(frequencies))
         finest = max(GRID * lmax_fields, FIELDS_GRID) if band is None else band
-        grid = SphereGrid.of(lmax_fields, finest)
+        grid = sphere_grid.SphereGrid.of(lmax_fields, finest)
         at = grid.directions()
         levels = np.stack([template(*at).reshape(grid.shape) for template in templates])
-        require_positive("the template", levels, "its logarithm is modelled")
+        checks.require_positive("the template", levels, "its logarithm is modelled")
         strength = weight(*at).reshape(grid.shape)
-        require_positive("the weight of the fields", strength)
-        require_shape("the sources", sources, (len(frequencies), None, n_modes(lmax)))
+        checks.require_positive("the weight of the fields", strength)
+        checks.require_shape("the sources", sources, (len(frequencies), None, n_modes(lmax)))
         x, y = frequencies / reference_mhz, frequencies / turnover_mhz
         mixing = np.stack([FIELDS[name](x, y) for name in names], axis=1)
         return cls(frequencies, mixing, grid, levels, strength, sources, lmax, names)
@@ -194,7 +193,7 @@ class PositiveSkies(eqx.Module):
         lmax, lmax_fields : int
             Highest ell of the maps, and of the exponents.
         """
-        grid = SphereGrid.of(lmax_fields, len(self.grid.theta) - 1)
+        grid = sphere_grid.SphereGrid.of(lmax_fields, len(self.grid.theta) - 1)
         return replace(self, grid=grid, sources=self.sources[:, :, : n_modes(lmax)], lmax=lmax)
 
     @property

@@ -21,12 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core import linalg
+from lusee_bayes.core import layouts, linalg
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import Described, extent, is_traced, require_array, require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import LARGEST_LMAX, per_mode
-from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.reading import read_text, reading
 
 Unknowns = Float[Array, " unknowns"]
@@ -250,16 +249,14 @@ class DiagonalPrior(Prior):
     def colour(self, u):
         return u * self.widths.reshape(*(1,) * (u.ndim - 1), -1)
 
-    def colour_columns(self, a):
-        return self.colour(a)
+    colour_columns = colour
 
     def whiten(self, m):
         xp, root = namespace(m, self), self.widths.reshape(*(1,) * (m.ndim - 1), -1)
         power = root != 0
         return m * xp.where(power, 1.0 / xp.where(power, root, 1.0), 0.0)
 
-    def whiten_columns(self, a):
-        return self.whiten(a)
+    whiten_columns = whiten
 
     def sandwich(self, matrix):
         return linalg.scaled(matrix, self.widths)
@@ -369,11 +366,11 @@ class HarmonicPrior(DiagonalPrior):
             raise InputError(wrong)
 
 
-SPECTRUM = Layout(
+SPECTRUM = layouts.Layout(
     "text file of ell and C_ell in K^2",
     {
-        "ell": Variable(("line",), "integer", low=0.0, grows=True),
-        "C_ell": Variable(("line",), low=0.0),
+        "ell": layouts.Variable(("line",), "integer", low=0.0, grows=True),
+        "C_ell": layouts.Variable(("line",), low=0.0),
     },
 )
 

@@ -28,11 +28,9 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Bool, Float
 
-from lusee_bayes.core import harmonics
+from lusee_bayes.core import checks, files, harmonics
 from lusee_bayes.core.arrays import Array, Modes, Pixels
-from lusee_bayes.core.checks import Described, number, require_array, require_whole
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import has_words, image_names, is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
@@ -40,7 +38,7 @@ from lusee_bayes.core.reading import naming, read_arrays, reading, require_file
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource, galaxy_map
 
 
-class Sky(Described, eqx.Module):
+class Sky(checks.Described, eqx.Module):
     """Brightness temperature of the whole sky at one frequency.
 
     Attributes
@@ -63,11 +61,11 @@ class Sky(Described, eqx.Module):
     name: str = eqx.field(static=True, default="sky")
 
     def __check_init__(self):
-        require_array("the sky", self.modes)
+        checks.require_array("the sky", self.modes)
         harmonics.lmax_of(self.modes.shape[-1])
 
     def description(self) -> tuple[str, ...]:
-        mean = number(self.modes[0] / np.sqrt(4.0 * np.pi))
+        mean = checks.number(self.modes[0] / np.sqrt(4.0 * np.pi))
         return (
             f"{self.name} at {self.frequency_mhz:g} MHz, lmax = {self.lmax}",
             f"{self.modes.shape[-1]} real coefficients, Galactic, in K; mean {mean} K",
@@ -88,7 +86,7 @@ class Sky(Described, eqx.Module):
         return harmonics.power_spectrum(self.modes)
 
 
-class SkyFile(Described, ABC):
+class SkyFile(checks.Described, ABC):
     """The content of one file of sky maps or coefficients, whole and checked.
 
     A new layout of files is a subclass, and one entry in
@@ -196,7 +194,7 @@ class SkyMap(SkyFile):
         InputError
             If the file cannot be used; the message states the error and its remedy.
         """
-        path = user_path(path)
+        path = files.user_path(path)
         hdf5 = h5py.is_hdf5(path)
         pixels = _read_hdf5(path, dataset or ULSA_DATASET) if hdf5 else _read_map(path)
         _require_healpix(path, pixels.size)
@@ -344,7 +342,7 @@ class SkyAlms(SkyFile):
             For a file that cannot be read, arrays that are missing or do not match, coefficients
             that do not fill an lmax, and numbers that are not finite.
         """
-        path = user_path(path)
+        path = files.user_path(path)
         if path.suffix == ".npz":
             arrays = read_arrays(path, NPZ, "check sky.file").arrays
             frequencies, alm = arrays["freq"], arrays["alm"]
@@ -405,11 +403,11 @@ def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str
     Path
         The file.
     """
-    with replacing(path) as partial:
+    with files.replacing(path) as partial:
         healpy.write_alm(partial, harmonics.to_healpy(modes), out_dtype=np.float64)
         with fits.open(partial, mode="update") as hdus:
             hdus[1].header.update({"TUNIT2": "K", "TUNIT3": "K", "EXTNAME": "ALM"} | header)
-    return user_path(path)
+    return files.user_path(path)
 
 
 def _read_alm_fits(path: Path) -> np.ndarray:
@@ -582,7 +580,7 @@ Sources = tuple[PointSource, ...]
 @lru_cache(maxsize=4)
 def _galaxy_modes(frequency_mhz: float, seed: int | None, lmax: int) -> np.ndarray:
     """Compute the diffuse sky's coefficients, read-only: variations of a scenario share one sky."""
-    require_whole("lmax", lmax, 0, 383)
+    checks.require_whole("lmax", lmax, 0, 383)
     nside = 64 if lmax <= 95 else 128
     modes = harmonics.map_to_modes(galaxy_map(frequency_mhz, nside=nside, seed=seed), lmax)
     modes.flags.writeable = False

@@ -22,10 +22,9 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from lusee_bayes.core import harmonics, linalg
 from lusee_bayes.core.arrays import DataVector, ModesMatrix
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import LARGEST_LMAX
-from lusee_bayes.core.linalg import checked_cholesky, main_directions, sandwich
 from lusee_bayes.core.section import Section, Treatment
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.linear.normal_matrix import normal_matrix
@@ -53,12 +52,12 @@ class AboveLmaxSection(Section):
     """
 
     margin: Annotated[int, Field(ge=1, le=64)] = 16
-    least_lmax: Annotated[int, Field(ge=0, le=LARGEST_LMAX)] = 63
+    least_lmax: Annotated[int, Field(ge=0, le=harmonics.LARGEST_LMAX)] = 63
     treatment: Treatment = "marginalised"
 
     def top(self, lmax: int) -> int:
         """Highest ell that is seen."""
-        return min(max(lmax + self.margin, self.least_lmax), LARGEST_LMAX)
+        return min(max(lmax + self.margin, self.least_lmax), harmonics.LARGEST_LMAX)
 
 
 class AboveLmax(LowRankNoise):
@@ -130,8 +129,8 @@ def sky_above(
     covariance, seen = (np.asarray(x)[n:, n:] for x in (covariance, normal_matrix(coupling, noise)))
     power = np.diagonal(seen) * np.diagonal(covariance)
     power = np.add.reduceat(power, np.arange(scenario.lmax + 1, lmax + 1) ** 2 - n)
-    root = checked_cholesky("the prior above lmax", covariance)
-    directions = main_directions(sandwich(seen, root), LEFT_OUT)
+    root = linalg.checked_cholesky("the prior above lmax", covariance)
+    directions = linalg.main_directions(linalg.sandwich(seen, root), LEFT_OUT)
     if (n_data := noise.size) * directions.shape[1] > MOST_NUMBERS:
         raise InputError(f"its effect on {n_data:,} data needs too much memory; average the data")
     directions = np.pad(root @ directions, ((n, 0), (0, 0)))

@@ -21,8 +21,7 @@ from jaxtyping import Bool, Float
 
 from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes, ModesMatrix
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.source import BeamSource, Receiver
+from lusee_bayes.instrument.beams import fields, source
 from lusee_bayes.instrument.coupling import CouplingMatrix, Instrument
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
@@ -118,15 +117,15 @@ class Setup:
     scenario: Any
     observation: Observation
     sky: Sky
-    beam_source: BeamSource
-    expected_source: BeamSource
-    beams: ProductBeams
+    beam_source: source.BeamSource
+    expected_source: source.BeamSource
+    beams: fields.ProductBeams
     coupling: CouplingMatrix
     prior: Prior
     responses: tuple[Grid, ...]
     background: Grid
     signal: Grid | None = None
-    receiver: Receiver | None = None
+    receiver: source.Receiver | None = None
     calibration: Calibration | None = None
     measured: bool = False
     family: PriorFamily | None = None
@@ -243,10 +242,8 @@ class Setup:
 
         Of all ports used, it depends on the autos, and in the exact form on the crosses, too.
         """
-        seen, (first, second, _) = (
-            np.asarray(self.layout.present).any(1),
-            ports(self.beam_source.n_ports),
-        )
+        seen = np.asarray(self.layout.present).any(1)
+        first, second, _ = ports(self.beam_source.n_ports)
         used = np.union1d(first[seen], second[seen])
         needed = np.isin(first, used) & np.isin(second, used)
         if self.scenario.noise.radiometer.form != "exact":

@@ -29,11 +29,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 from pydantic import Field
 
+from lusee_bayes.core import reading, sphere_grid
 from lusee_bayes.core.arrays import Array, Vector, as_complex, namespace
 from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment
-from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, beam_scale
 from lusee_bayes.instrument.products import ports, to_real
 from lusee_bayes.systematics.context import Around, Setup
@@ -100,15 +99,15 @@ class FieldErrors(ChangedBeams):
     above: Float[Array, "rings phi"]
     sizes: Float[Array, " ports"]
     harmonics: Float[Array, "harmonics rings phi"]
-    grid: SphereGrid
+    grid: sphere_grid.SphereGrid
     expectation: FieldErrorsSection = eqx.field(static=True)
 
     @classmethod
     def build(cls, section: FieldErrorsSection, setup: Setup, around: Around) -> FieldErrors:
         band, values = setup.beams.lmax + 2 * section.lmax, around.values or {}
-        grid, sky = SphereGrid.of(band, band), HemisphereGrid.for_lmax(band)
+        grid, sky = sphere_grid.SphereGrid.of(band, band), HemisphereGrid.for_lmax(band)
         source, mhz = setup.beam_source, setup.frequency_mhz
-        with naming(cls.key):
+        with reading.naming(cls.key):
             beam = source.fields(mhz, sky)
         theta, phi = np.asarray(beam.e_theta), np.asarray(beam.e_phi)
         cos, sin = np.cos(sky.phi), np.sin(sky.phi)

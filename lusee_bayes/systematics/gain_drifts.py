@@ -20,13 +20,8 @@ from lusee_bayes.core.section import NOT_TINY, Positive, Section, Treatment, req
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian, Solution
-from lusee_bayes.noise.instrument_errors import (
-    GainDrift,
-    Gains,
-    slopes_by_gains,
-    white_grid,
-    with_gains,
-)
+from lusee_bayes.noise import instrument_errors
+from lusee_bayes.noise.instrument_errors import GainDrift, Gains, slopes_by_gains, with_gains
 from lusee_bayes.systematics import systematic
 from lusee_bayes.systematics.context import Around, NoiseAbout, Setup, Volume, noise_visibilities
 
@@ -184,7 +179,9 @@ class GainDrifts(systematic.Systematic):
                 f"noise.gain.correlation_h is {ends[0]:.3g} h at least, too short for "
                 f"{hours[-1] - hours[0]:.4g} h of data; use noise.radiometer.factor"
             )
-        grid = white_grid(hours, *ends, per_correlation=PER_CORRELATION, margin=MARGIN)
+        grid = instrument_errors.white_grid(
+            hours, *ends, per_correlation=PER_CORRELATION, margin=MARGIN
+        )
         widths, stds = (drift.width(hours), longest.width(hours)), (log_sigma_std, log_std)
         times = jnp.asarray(hours), jnp.asarray(grid)
         return cls(drift, visibilities, *times, layout, *widths, *stds)
@@ -216,9 +213,8 @@ class GainDrifts(systematic.Systematic):
         """Multiply by one draw of the drifts."""
         drift = GainDrift(truth["gain_sigma"], truth["gain_correlation_h"])
         gains = drift.sample(cls.own_key(key), setup.observation.hours)
-        return systematic.multiplied(
-            model, np.asarray(cls.build(section, setup, Around()).response(gains))
-        )
+        response = cls.build(section, setup, Around()).response(gains)
+        return systematic.multiplied(model, np.asarray(response))
 
     @property
     def n_antennas(self) -> int:

@@ -38,10 +38,9 @@ from jaxtyping import Float
 from numpy.polynomial.legendre import leggauss, legint, legval, legvander
 from pydantic import Field
 
+from lusee_bayes.core import layouts, reading
 from lusee_bayes.core.arrays import Array, Modes, namespace
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.layouts import Layout, Variable
-from lusee_bayes.core.reading import read_table
 from lusee_bayes.core.section import NOT_TINY, Section, Temperature, Treatment, requires
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.instrument.pointing import offset_names, with_offsets
@@ -51,9 +50,9 @@ from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values, wi
 
 Altitudes = Float[Array, "runs azimuths"]
 COLUMNS = {"azimuth_deg": (-360.0, 360.0), "altitude_deg": (0.0, 45.0)}
-TABLE = Layout(
+TABLE = layouts.Layout(
     f"a table of the horizon with the columns {' and '.join(COLUMNS)}",
-    {name: Variable(("row",), low=low, high=high) for name, (low, high) in COLUMNS.items()},
+    {name: layouts.Variable(("row",), low=low, high=high) for name, (low, high) in COLUMNS.items()},
 )
 AZIMUTHS = 1440
 # largest deviation from the known altitude, in prior standard deviations
@@ -111,7 +110,7 @@ class HorizonSection(Section):
         """
         if self.file is None:
             return np.full(azimuth.shape, np.radians(self.altitude_deg))
-        columns = read_table(self.file, TABLE, "check noise.horizon.file")
+        columns = reading.read_table(self.file, TABLE, "check noise.horizon.file")
         rows = [columns[name] for name in COLUMNS]
         if len(rows[0]) < 2:
             raise InputError(f"{self.file} has one row; expected two or more of {TABLE.what}")

@@ -17,10 +17,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from pydantic import Field
 
+from lusee_bayes.core import harmonics, reading
 from lusee_bayes.core.arrays import Array, DataVector, namespace, on_device
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import Rotation, generators
-from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment, requires
 from lusee_bayes.instrument import pointing as pointings
 from lusee_bayes.instrument.beams.monopoles import Monopoles
@@ -189,8 +188,8 @@ class PointingOffsets(Systematic):
         turn = np.einsum("tji,tjkn->tikn", np.asarray(orientation), np.asarray(slopes))
         beams, ways = [], []
         for axis in range(3):
-            blocks = (generators(ell)[axis] for ell in range(model.coupling.lmax + 1))
-            beams.append(Rotation(tuple(blocks))(np.asarray(model.coupling.modes)))
+            blocks = (harmonics.generators(ell)[axis] for ell in range(model.coupling.lmax + 1))
+            beams.append(harmonics.Rotation(tuple(blocks))(np.asarray(model.coupling.modes)))
             ways.append(turn[:, (axis + 2) % 3, (axis + 1) % 3][np.asarray(self.layout.time)])
         see = model.coupling.along(beams, pointing)
 
@@ -307,7 +306,7 @@ class MovingSources(eqx.Module):
 def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
     """The setup with another observation, its A and its responses to sources."""
     given = ", ".join(f"{name} = {value:g}" for name, value in values.items() if value)
-    with naming(f"noise.pointing, with {given or 'no offsets'}"):
+    with reading.naming(f"noise.pointing, with {given or 'no offsets'}"):
         observation = pointings.with_offsets(setup.observation, values)
     if any(values.get(name) for name in pointings.CLOCK):
         frame = np.asarray(setup.pointing.pole_frame)

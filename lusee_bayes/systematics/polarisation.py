@@ -40,10 +40,9 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
+from lusee_bayes.core import harmonics, reading
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.harmonics import azimuth_functions, mode_numbers, per_mode
 from lusee_bayes.core.lazy import special
-from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import Section, Treatment
 from lusee_bayes.instrument.beams import fields as beam_fields
 from lusee_bayes.instrument.coupling import CouplingMatrix
@@ -101,7 +100,7 @@ class Polarisation(LowRankNoise):
     @classmethod
     def build(cls, section: PolarisationSection, setup: Setup, around: Around) -> Polarisation:
         grid, lmax = beam_fields.HemisphereGrid.for_lmax(section.lmax), section.lmax
-        with naming(cls.key):
+        with reading.naming(cls.key):
             fields = setup.beam_source.fields(setup.beams.frequency_mhz, grid)
         scale = beam_fields.beam_scale(fields, setup.beams)
         mean = float(setup.sky.modes[0]) / np.sqrt(4.0 * np.pi)
@@ -115,7 +114,7 @@ class Polarisation(LowRankNoise):
             beams += [(each, LINEAR, modes) for modes in linear_modes(fields, lmax)]
         pointing, columns = Pointing.of(setup.observation, lmax), []
         for share, lowest, modes in beams:
-            std = mean * np.sqrt(per_mode(unit_spectrum(lmax, lowest, section.slope)))
+            std = mean * np.sqrt(harmonics.per_mode(unit_spectrum(lmax, lowest, section.slope)))
             coupling = CouplingMatrix.of_modes(scale * np.asarray(modes), pointing, setup.layout)
             columns.append((coupling.dense() * (share * std)[None])[:, lowest**2 :])
         return cls("polarisation", setup.layout, np.concatenate(columns, axis=1))
@@ -151,7 +150,7 @@ def linear_modes(fields: beam_fields.AntennaFields, lmax: int) -> tuple[Modes, M
         Real packed; e @ E + b @ B are the visibilities of a sky with these modes in the frame of
         the antennas, in the unit of the fields squared. Zero for ell < 2.
     """
-    grid, (ell, m) = fields.grid, mode_numbers(lmax)
+    grid, (ell, m) = fields.grid, harmonics.mode_numbers(lmax)
     table = special.sph_legendre_p_all(lmax, lmax, grid.theta, diff_n=1)
     polar, slope = np.swapaxes(table[:, ell, np.abs(m)], 1, 2)
     sin, cot = np.sin(grid.theta)[:, None], 1.0 / np.tan(grid.theta)[:, None]
@@ -161,7 +160,7 @@ def linear_modes(fields: beam_fields.AntennaFields, lmax: int) -> tuple[Modes, M
     even = weights * (2.0 * cot * slope + (product - 2.0 * m**2 / sin**2) * polar)
     # df_m / dphi is m f_-m
     odd = -2.0 * weights * m * (slope - cot * polar) / sin
-    azimuth = azimuth_functions(grid.phi, lmax)
+    azimuth = harmonics.azimuth_functions(grid.phi, lmax)
     q, u = (
         np.asarray(to_real(beam_fields.stokes_beam(fields, stokes))) @ azimuth for stokes in "QU"
     )

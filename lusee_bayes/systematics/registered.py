@@ -28,20 +28,9 @@ from lusee_bayes.systematics.systematic import Systematic
 
 # in the order in which they are applied to the model
 SYSTEMATICS: tuple[type[Systematic], ...] = (
-    NoiseLevel,
-    PriorSpectrum,
-    BeamErrors,
-    FieldErrors,
-    Horizon,
-    PointingOffsets,
-    AboveLmax,
-    PointSources,
-    Receivers,
-    RegolithTemperature,
-    Polarisation,
-    GainTable,
-    GainDrifts,
-)
+    NoiseLevel, PriorSpectrum, BeamErrors, FieldErrors, Horizon, PointingOffsets, AboveLmax,
+    PointSources, Receivers, RegolithTemperature, Polarisation, GainTable, GainDrifts,
+)  # fmt: skip
 
 _TERMS = {
     cls.key.removeprefix("noise."): (cls.section | None, None)

@@ -27,9 +27,8 @@ import lusee_bayes
 from lusee_bayes.cli.commands import app
 from lusee_bayes.cli.options import ScenarioOptions
 from lusee_bayes.cli.tables import checks_table, comparison_table
+from lusee_bayes.core import harmonics, version
 from lusee_bayes.core.arrays import SWITCH
-from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
-from lusee_bayes.core.version import COMMAND
 from lusee_bayes.experiment.scenario import OutputSection, load_scenario, scenario_names
 from lusee_bayes.judge.chi2 import HEADLINES
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
@@ -65,20 +64,20 @@ def test_the_files_agree_with_each_other(folder):
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std, rtol=1e-7)
     nside, columns = 8, healpy.read_map(folder / "map.fits", field=None, dtype=np.float64)
     kelvin, got, observed, truth, residual, *drawn = columns
-    np.testing.assert_allclose(kelvin, modes_to_map(mean, nside), rtol=1e-12)
-    y = pixel_matrix(nside, 8)
+    np.testing.assert_allclose(kelvin, harmonics.modes_to_map(mean, nside), rtol=1e-12)
+    y = harmonics.pixel_matrix(nside, 8)
     np.testing.assert_allclose(got, np.sqrt(np.einsum("pi,ij,pj->p", y, covariance, y)), rtol=1e-6)
     np.testing.assert_allclose(kelvin - truth, residual, rtol=0, atol=1e-9 * kelvin.max())
     np.testing.assert_array_equal(observed, FinishedRun.read(folder).channel.highest_altitude >= 0)
     skies = sky_draws_of(folder)[0][:100]
     assert len(drawn) == 100
-    np.testing.assert_allclose(drawn[7], modes_to_map(skies[7], nside), rtol=1e-10)
+    np.testing.assert_allclose(drawn[7], harmonics.modes_to_map(skies[7], nside), rtol=1e-10)
     # 400 draws: each variance to 5 sigma of sqrt(2 / 400), 81 of them
     ratio = sky_draws_of(folder)[0].var(axis=0, ddof=1) / std**2
     assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / 400)
     # sqrt(2) there and back again
     alm = healpy.read_alm(folder / "mean_alm.fits")
-    np.testing.assert_allclose(from_healpy(alm), mean, rtol=4e-16)
+    np.testing.assert_allclose(harmonics.from_healpy(alm), mean, rtol=4e-16)
     table = Table.read(folder / "power_spectra.ecsv")
     assert table["cl_mean"].unit == "K2"
     columns = "frequency_mhz ell rho snr cl_prior cl_mean cl_truth cl_posterior_variance"
@@ -308,7 +307,7 @@ CALLS = [
 def test_a_call_ends_with_a_code_and_leaves_no_trace_of_its_command(line, code, words, capsys):
     assert run(*line.split()) == code
     assert words in capsys.readouterr().err
-    assert COMMAND.get() == ""
+    assert version.COMMAND.get() == ""
 
 
 def test_tables_fit_eighty_columns(finished):
@@ -485,10 +484,9 @@ def test_what_one_process_compiles_the_next_one_finds(tmp_path):
 
 
 @pytest.mark.long
-def test_it_can_be_switched_off_and_do_without(tmp_path):
+def test_it_can_be_switched_off_and_do_without(write):
     assert compiled("off")[0] == "0\n"
     # a place that cannot be written to: programs are compiled anew, and nothing is said
-    blocked = tmp_path / "file"
-    blocked.write_text("not a folder")
+    blocked = write("not a folder", "file")
     assert compiled(blocked)[0] == "0\n"
     assert blocked.read_text() == "not a folder"

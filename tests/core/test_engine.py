@@ -88,15 +88,10 @@ def opened(demand=DEMAND, **given):
         pass
 
 
-@pytest.fixture
-def large(monkeypatch):
-    """A machine of 64 GB, without a cluster."""
+def test_one_worker_is_this_process_which_needs_no_dask(monkeypatch):
+    # a machine of 64 GB, without a cluster
     monkeypatch.setattr(engine, "memory_limit", lambda: 64 * 10**9)
     monkeypatch.delenv(engine.SCHEDULER, raising=False)
-
-
-@pytest.mark.usefixtures("large")
-def test_one_worker_is_this_process_which_needs_no_dask(monkeypatch):
     monkeypatch.setattr(engine, "find_spec", lambda name: None)
     for n in (None, 1):
         with engine.open_engine(DEMAND, n) as found:

@@ -133,13 +133,11 @@ def test_the_citation_is_whole():
     assert all(f'"{name}"' in metadata for name in cited)
 
 
-def test_the_scenarios_of_the_pages_are_scenarios(tmp_path):
+def test_the_scenarios_of_the_pages_are_scenarios(write):
     found = re.findall(r"```yaml\n(.*?)```", (DOCS / "scenarios.md").read_text(), flags=re.DOTALL)
     assert found
     for text in found:
-        path = tmp_path / "mine.yaml"
-        path.write_text(text)
-        lb.load_scenario(path)
+        lb.load_scenario(write(text, "mine.yaml"))
 
 
 def test_every_module_has_an_entry_in_the_api():

@@ -21,10 +21,9 @@ from scipy.linalg import eigh
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import digest_of, items_of
 from lusee_bayes.experiment.model import full_model, set_up, simulate
+from lusee_bayes.instrument import schedule, waterfalls
 from lusee_bayes.instrument.averaging import averaged
-from lusee_bayes.instrument.schedule import read_schedule
 from lusee_bayes.instrument.visibilities import read_visibilities
-from lusee_bayes.instrument.waterfalls import write_waterfall
 from lusee_bayes.linear.linear_gaussian import Form, form_of
 from lusee_bayes.runs.cost import posterior_cost, simulation_cost
 from lusee_bayes.runs.plan_run import default_variations, expected_inference, forecast
@@ -154,7 +153,7 @@ def test_waterfalls_are_instants_unless_the_scenario_says_other(tmp_path):
 def test_waterfalls_have_no_room_for_windows(tmp_path):
     data = lb.build(scenario("observation.window=mean")).data
     words = r"hold instants.*observation\.window=instant"
-    refuse(words, write_waterfall, tmp_path / "w.fits", 2 * [data])
+    refuse(words, waterfalls.write_waterfall, tmp_path / "w.fits", 2 * [data])
     assert not list(tmp_path.iterdir())
 
 
@@ -168,10 +167,8 @@ start,end,turntable_deg,duty_cycle
 
 
 @pytest.fixture
-def path(tmp_path):
-    path = tmp_path / "nights.csv"
-    path.write_text(TABLE)
-    return path
+def path(write):
+    return write(TABLE, "nights.csv")
 
 
 @pytest.fixture
@@ -182,7 +179,7 @@ def given(path):
 def test_a_schedule_is_simulated_and_mapped(path, given, tmp_path):
     scenario = lb.load_scenario("fiducial", given)
     observation = scenario.observation.observation()
-    expected = lb.Observation.from_schedule(read_schedule(path), step_s=STEP_S)
+    expected = lb.Observation.from_schedule(schedule.read_schedule(path), step_s=STEP_S)
     np.testing.assert_array_equal(observation.times.jd, expected.times.jd)
     np.testing.assert_array_equal(observation.live_s, expected.live_s)
     # 3 days, 47.5 hours and 5.5 days in steps of 20000 s: 13, 9 and 24 of them

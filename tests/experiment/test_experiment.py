@@ -151,10 +151,8 @@ BAD_SPECTRA = [
 
 
 @pytest.mark.parametrize(("text", "words"), BAD_SPECTRA)
-def test_a_bad_spectrum_is_refused(tmp_path, text, words):
-    path = tmp_path / "cl.txt"
-    path.write_text(text)
-    refuse(words, read_spectrum, path, FILE_LMAX)
+def test_a_bad_spectrum_is_refused(write, text, words):
+    refuse(words, read_spectrum, write(text, "cl.txt"), FILE_LMAX)
 
 
 def test_missing_and_coarse_files_are_refused(files):

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.leave_out import without
-from lusee_bayes.experiment.model import full_model, set_up, simulate
+from lusee_bayes.experiment import leave_out, model
 
 SCENARIO = (
     "lmax=4",
@@ -19,15 +18,15 @@ SCENARIO = (
 
 @pytest.mark.essential
 def test_the_model_of_some_times_is_that_of_all_without_the_others():
-    setup = set_up(lb.load_scenario("fiducial", SCENARIO))
-    data = simulate(setup)
+    setup = model.set_up(lb.load_scenario("fiducial", SCENARIO))
+    data = model.simulate(setup)
     flags = np.zeros((data.layout.n_products, data.layout.n_times), dtype=bool)
     flags[3, 5], flags[:, 7] = True, True
-    setup, data = without(setup, data, flags)
+    setup, data = leave_out.without(setup, data, flags)
     keep = np.arange(data.layout.n_times) % 3 != 1
     some, few, rows = setup.select(keep), data.select(keep), keep[np.asarray(data.layout.time)]
     np.testing.assert_array_equal(few.data, data.data[rows])
-    whole, part = full_model(setup), full_model(some)
+    whole, part = model.full_model(setup), model.full_model(some)
     expected = np.asarray(whole.coupling.dense())[rows]
     np.testing.assert_allclose(part.coupling.dense(), expected, atol=1e-14 * np.abs(expected).max())
     np.testing.assert_allclose(part.offset, whole.offset[rows], rtol=1e-12)

@@ -12,12 +12,9 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import per_kelvin_of, reduce_files
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.model import set_up
-from lusee_bayes.flight.gain_model import synthetic_gains
-from lusee_bayes.flight.recipe import FlightSimulatedSection
+from lusee_bayes.flight import gain_model, recipe, session, synthesis
 from lusee_bayes.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED, write_reduced
-from lusee_bayes.flight.session import CHANNEL_MHZ
 from lusee_bayes.flight.session_files import read_session
-from lusee_bayes.flight.synthesis import Disturbances
 from lusee_bayes.instrument.products import all_products, auto_indices, labels
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.noise.radiometer import exact_blocks
@@ -150,7 +147,7 @@ def test_disturbances_are_found_and_little_else(tmp_path):
     saturated, tone, comb = truth["saturated"], truth["tone"], truth["comb"]
     burst = truth["burst"] & ~saturated
     assert min(saturated.sum(), tone.sum(), comb.sum(), burst.sum()) > 8
-    mhz = np.arange(2048) * CHANNEL_MHZ
+    mhz = np.arange(2048) * session.CHANNEL_MHZ
     for band, f in enumerate(FREQUENCIES):
         reason = reduced.reason[band]
         np.testing.assert_array_equal(reason == SATURATED, saturated)
@@ -224,8 +221,8 @@ def test_a_tone_that_no_bin_holds_is_refused():
     """Navgf 3 leaves out every fourth channel, the last of each bin."""
 
     def drawn(channel):
-        section = FlightSimulatedSection(navgf=3, tones_mhz=(0.025 * channel,))
-        return Disturbances.drawn(section, np.arange(20.0), 3600.0, "centre", 1)
+        section = recipe.FlightSimulatedSection(navgf=3, tones_mhz=(0.025 * channel,))
+        return synthesis.Disturbances.drawn(section, np.arange(20.0), 3600.0, "centre", 1)
 
     for channel in (1000, 1001, 1002):
         assert np.flatnonzero(drawn(channel).tone_channel).tolist() == [channel]
@@ -240,7 +237,7 @@ def test_gains_are_off_as_they_are_said_to_be(tmp_path):
     z = dict(zip(truth["gain_error_name"].tolist(), truth["gain_error"].tolist(), strict=True))
     assert len(z) == 3 * 4 * 3
     known, _ = simulated(tmp_path / "known", QUIET, EXACT, rows=3, step_s=7200.0)
-    seen, table = read_session(tmp_path / "session_000.h5").telemetry, synthetic_gains()
+    seen, table = read_session(tmp_path / "session_000.h5").telemetry, gain_model.synthetic_gains()
     eps = np.empty((4, len(FREQUENCIES), 3))
     for port in range(4):
         basis = table.basis("M", port, np.array(FREQUENCIES))[..., None]

@@ -83,17 +83,14 @@ def test_a_notch_is_a_comb_below_and_a_strong_line_is_none():
     assert not fl.comb_strength(spectra, frames, AVERAGING[4], MHZ).any()
 
 
-def test_known_lines_take_the_channels_about_them(tmp_path):
+def test_known_lines_take_the_channels_about_them(write):
     lines = (20.8875,)
     # half-way between channels 835 and 836
     assert np.flatnonzero(fl.line_bins(lines, AVERAGING[1], MHZ)).tolist() == [834, 835, 836, 837]
     assert np.flatnonzero(fl.line_bins(lines, AVERAGING[4], MHZ)).tolist() == [208, 209]
     assert not fl.line_bins((), AVERAGING[1], MHZ).any()
-    path = tmp_path / "lines.csv"
-    path.write_text("frequency_mhz,source\n20.8875,rover\n")
-    assert fl.read_lines(path) == lines
-    path.write_text("frequency,source\n20.8875,rover\n")
-    assert_refused(lambda: fl.read_lines(path))
+    assert fl.read_lines(write("frequency_mhz,source\n20.8875,rover\n", "lines.csv")) == lines
+    assert_refused(lambda: fl.read_lines(write("frequency,source\n20.8875,rover\n", "lines.csv")))
 
 
 # one day at 42 s
@@ -159,11 +156,6 @@ def test_with_few_spectra_nothing_is_told():
     assert np.isnan(scatter).all()
 
 
-def spectrum(mhz, coefficients):
-    """A polynomial about 10 MHz."""
-    return sum(c * (mhz - 10.0) ** k for k, c in enumerate(coefficients))
-
-
 def binned(averaging, per_channel):
     """What the flight software makes of channels, one bin after the other."""
     starts = averaging.stride * np.arange(averaging.n_bins)
@@ -176,7 +168,8 @@ def binned(averaging, per_channel):
 def test_polynomials_of_the_degree_are_exact_in_the_middle(navgf, degree, origin):
     averaging, mhz = AVERAGING[navgf], channel_mhz(origin)
     band = ChannelBand.of(10.0, 2.0, degree, averaging, mhz)
-    values = binned(averaging, spectrum(mhz, [3.0, 0.5, -0.2, 0.1, 0.05][: degree + 1]))
+    coefficients = [3.0, 0.5, -0.2, 0.1, 0.05][: degree + 1]
+    values = binned(averaging, sum(c * (mhz - 10.0) ** k for k, c in enumerate(coefficients)))
     here = values[band.first : band.last]
     good = np.random.default_rng(2).random((6, len(here))) > 0.15
     good[0] = True

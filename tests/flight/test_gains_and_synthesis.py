@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from assertions import refuse
+from assertions import assert_same, refuse
 from naive_flight import naive_gain
 
 from lusee_bayes.flight.gain_model import GainModel, read_gain_table, write_gain_table
@@ -84,8 +84,7 @@ def test_luseepys_folder_and_own_file_hold_the_same(tmp_path, model):
     folder = write_folder(tmp_path / "gain", made, model)
     own = write_gain_table(tmp_path / "gains.nc", made)
     for found in (read_gain_table(folder, model), read_gain_table(own)):
-        for name in ("anchor_mhz", "mean", "components", "coefficient"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
+        assert_same(found, made, "anchor_mhz", "mean", "components", "coefficient")
     np.testing.assert_array_equal(read_gain_table(own).component_std, made.component_std)
 
 

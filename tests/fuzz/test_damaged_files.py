@@ -16,12 +16,9 @@ from layout_4 import write_layout_4
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import reduce_files
-from lusee_bayes.flight.gain_model import read_gain_table
-from lusee_bayes.flight.reduced import read_reduced, write_reduced
-from lusee_bayes.flight.session_files import read_session
+from lusee_bayes.flight import gain_model, reduced, session_files
+from lusee_bayes.instrument import visibilities, waterfalls
 from lusee_bayes.instrument.beams.sampled import read_beam, sampled_beams, write_sampled_beams
-from lusee_bayes.instrument.visibilities import read_visibilities
-from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
 from lusee_bayes.report.pages import write_report
 from lusee_bayes.results.finished_runs import read_channels, read_information, read_runs
@@ -39,37 +36,29 @@ def read_sky(path: Path) -> object:
 
 
 def read_spectra(path: Path) -> object:
-    session = read_session(path)
+    session = session_files.read_session(path)
     with session.spectra() as read:
         return read(0, session.n_rows)
 
 
 LMAX_2 = small_scenario(lmax=2)
-READERS = {
-    "visibilities.nc": (describe, read_visibilities),
-    "windows.nc": (describe, read_visibilities),
-    "waterfall.fits": (describe, read_waterfall, lambda path: lb.read_data(path, LMAX_2)),
-    "four_port.fits": (describe, read_waterfall),
-    "scalar_beam.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
-    "response.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
-    "sampled_fields.nc": (describe, lambda path: read_beam(path).beams(25.0, 2)),
-    "sampled_fields.fits": (describe, lambda path: read_beam(path).beams(25.0, 2)),
-    "sampled_products.nc": (describe, lambda path: read_beam(path).beams(25.0, 2)),
-    "posterior.nc": (describe,),
-    "information.nc": (describe, lambda path: read_information(path, LMAX_2)),
-    "cube.nc": (describe,),
-    "diagnostics.nc": (describe, read_channels),
-    "map.fits": (describe, read_sky),
-    "cube.fits": (describe, read_sky),
-    "alm.fits": (describe, read_sky),
-    "alms.npz": (describe, read_sky),
-    "sky.hdf5": (describe, read_sky),
-    "session.h5": (describe, read_spectra),
-    "session_4.h5": (describe, read_spectra),
-    "session.fits": (describe, read_spectra),
-    "reduced.nc": (describe, lambda path: read_reduced(path).at(25.0, np.ones(4))),
-    "gains.nc": (describe, read_gain_table),
+# of files, named in words, beside their description
+READ = {
+    "visibilities.nc windows.nc": [visibilities.read_visibilities],
+    "waterfall.fits": [waterfalls.read_waterfall, lambda path: lb.read_data(path, LMAX_2)],
+    "four_port.fits": [waterfalls.read_waterfall],
+    "scalar_beam.fits response.fits": [lambda path: read_beam(path).beams(10.0, 2)],
+    "sampled_fields.nc sampled_fields.fits": [lambda path: read_beam(path).beams(25.0, 2)],
+    "sampled_products.nc": [lambda path: read_beam(path).beams(25.0, 2)],
+    "posterior.nc cube.nc": [],
+    "information.nc": [lambda path: read_information(path, LMAX_2)],
+    "diagnostics.nc": [read_channels],
+    "map.fits cube.fits alm.fits alms.npz sky.hdf5": [read_sky],
+    "session.h5 session_4.h5 session.fits": [read_spectra],
+    "reduced.nc": [lambda path: reduced.read_reduced(path).at(25.0, np.ones(4))],
+    "gains.nc": [gain_model.read_gain_table],
 }
+READERS = {name: [describe, *read] for names, read in READ.items() for name in names.split()}
 
 # files of the package
 OWN = tuple(name for name in READERS if name.endswith(".nc"))
@@ -87,7 +76,7 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     experiment.data.write(folder / "visibilities.nc")
     experiment.data.stamped("start").write(folder / "windows.nc")
     channels = [replace(experiment.data, frequency_mhz=f) for f in (20.0, 25.0)]
-    write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
+    waterfalls.write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
     theta, phi = np.linspace(0.0, 90.0, 7), np.arange(0.0, 360.0, 45.0)
     fields = np.ones((4, 7, 8), dtype=complex)
     sampled = sampled_beams(25.0, e_theta=fields, e_phi=fields, theta_deg=theta, phi_deg=phi)
@@ -124,7 +113,7 @@ def write_sessions(folder: Path) -> None:
         shutil.copy(made.sessions[0], folder / name)
     write_layout_4(folder / "session_4.h5")
     known = lb.load_scenario(str(made.scenario), ["observation.average_s=null"])
-    write_reduced(folder / "reduced.nc", reduce_files(list(made.sessions), known))
+    reduced.write_reduced(folder / "reduced.nc", reduce_files(list(made.sessions), known))
     shutil.copy(made.scenario.parent / "gains.nc", folder / "gains.nc")
 
 

@@ -295,14 +295,10 @@ def test_the_map_from_luseepys_four_ports(luseepy, tmp_path, test_data):
 
 
 CONTRADICTIONS = [
-    *({key: "another"} for key in CONVENTIONS),
-    {"INPUT_KIND": "loaded"},
-    {"FIELD_KIND": "rE"},
-    {"FIELD_UNIT": "V/m"},
-    {"FIELD_UNIT": "m", "NORM_KIND": "current"},
-    {"NORM_KIND": "guessed"},
+    *({key: "another"} for key in CONVENTIONS), {"INPUT_KIND": "loaded"}, {"FIELD_KIND": "rE"},
+    {"FIELD_UNIT": "V/m"}, {"FIELD_UNIT": "m", "NORM_KIND": "current"}, {"NORM_KIND": "guessed"},
     {"BUNIT": "V"},
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("words", CONTRADICTIONS, ids=str)

@@ -13,14 +13,8 @@ from astropy.io import fits
 from reference import tangents, unit_vectors, vectors
 
 import lusee_bayes as lb
+from lusee_bayes.instrument.beams import monopoles, sampled
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings
-from lusee_bayes.instrument.beams.monopoles import Monopoles, wavenumber
-from lusee_bayes.instrument.beams.sampled import (
-    from_uvbeam,
-    read_beam,
-    sampled_beams,
-    write_sampled_beams,
-)
 from lusee_bayes.instrument.products import labels, to_real
 from lusee_bayes.report.describe import describe
 from lusee_bayes.testing import check_beam_source, small_scenario
@@ -72,7 +66,7 @@ KINDS = {
 
 @cache
 def embedded(kind, frequency_mhz=FREQUENCY):
-    return KINDS[kind](Monopoles(), frequency_mhz)
+    return KINDS[kind](monopoles.Monopoles(), frequency_mhz)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -80,7 +74,7 @@ def test_short_dipoles_have_their_closed_form(kind):
     """Dipoles u at places r: B_ij = (u.v - (u.n)(v.n)) / 2 exp(i k n.(r_i - r_j)), no angles."""
     rng = np.random.default_rng(2)
     arms, places = rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
-    k = wavenumber(FREQUENCY)
+    k = monopoles.wavenumber(FREQUENCY)
 
     class Dipoles:
         def towards(self, _, theta, phi):
@@ -89,7 +83,7 @@ def test_short_dipoles_have_their_closed_form(kind):
             phase = np.exp(1j * k * np.tensordot(places, n, 1))
             return tuple(np.tensordot(arms, axis, 1) * phase for axis in along)
 
-    made = sampled_beams(FREQUENCY, **KINDS[kind](Dipoles()), absolute=True)
+    made = sampled.sampled_beams(FREQUENCY, **KINDS[kind](Dipoles()), absolute=True)
     grid = HemisphereGrid.gauss_legendre(12, 20)
     n = unit_vectors(grid)
     along, phase = np.tensordot(arms, n, 1), np.exp(1j * k * np.tensordot(places, n, 1))
@@ -122,14 +116,14 @@ def test_rings_go_through_the_zenith():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_sampled_beams_keep_the_contract(kind):
-    source = replace(sampled_beams(FREQUENCY, **embedded(kind)), turntable_offset_deg=5.0)
+    source = replace(sampled.sampled_beams(FREQUENCY, **embedded(kind)), turntable_offset_deg=5.0)
     turned = replace(source, turntable_offset_deg=35.0)
     sizes = {"frequency_mhz": FREQUENCY, "lmax": LMAX, "quadrature": SPLINES}
     check_beam_source(source, turned, turned_deg=30.0, **sizes)
 
 
 def modes_of(given, **more):
-    return sampled_beams(FREQUENCY, **given, **more).beams(FREQUENCY, LMAX).modes
+    return sampled.sampled_beams(FREQUENCY, **given, **more).beams(FREQUENCY, LMAX).modes
 
 
 def test_the_scale_is_the_autos_or_the_files():
@@ -139,7 +133,7 @@ def test_the_scale_is_the_autos_or_the_files():
     np.testing.assert_allclose(autos.mean(), 1.0, rtol=1e-12)
     one, nine = (modes_of(g, absolute=True) for g in (given, bright))
     np.testing.assert_allclose(nine, 9.0 * one, rtol=1e-12, atol=1e-12 * np.abs(nine).max())
-    as_given = replace(sampled_beams(FREQUENCY, **bright), normalise=False)
+    as_given = replace(sampled.sampled_beams(FREQUENCY, **bright), normalise=False)
     np.testing.assert_array_equal(as_given.beams(FREQUENCY, LMAX).modes, nine)
 
 
@@ -149,9 +143,9 @@ def test_files_come_back(tmp_path, kind, suffix):
     one, two = (embedded(kind, f) for f in (20.0, 30.0))
     angles = {name for name in one if name.endswith("deg")}
     arrays = {n: v if n in angles else np.stack([v, two[n]]) for n, v in one.items()}
-    made = sampled_beams([20.0, 30.0], **arrays, absolute=True)
-    path = write_sampled_beams(tmp_path / f"mine.{suffix}", made)
-    again = read_beam(path)
+    made = sampled.sampled_beams([20.0, 30.0], **arrays, absolute=True)
+    path = sampled.write_sampled_beams(tmp_path / f"mine.{suffix}", made)
+    again = sampled.read_beam(path)
     assert again.absolute
     np.testing.assert_array_equal(again.frequencies_mhz, [20.0, 30.0])
     # the grid's angles go through degrees and back: one rounding
@@ -165,7 +159,7 @@ def test_files_come_back(tmp_path, kind, suffix):
 
 def test_a_scenario_takes_the_file(tmp_path):
     path = tmp_path / "mine.nc"
-    write_sampled_beams(path, sampled_beams(FREQUENCY, **embedded("pixels")))
+    sampled.write_sampled_beams(path, sampled.sampled_beams(FREQUENCY, **embedded("pixels")))
     scenario = small_scenario(f"beam.file={path}")
     assert scenario.beam.model == "sampled"
     assert (scenario.beam.source().n_ports, scenario.beam.label) == (4, "mine.nc")
@@ -177,17 +171,17 @@ def test_a_scenario_takes_the_file(tmp_path):
 
 def test_product_beams_of_a_file_may_be_in_any_order(tmp_path):
     path = tmp_path / "mine.nc"
-    made = sampled_beams(FREQUENCY, **embedded("products on pixels"))
-    write_sampled_beams(path, made)
+    made = sampled.sampled_beams(FREQUENCY, **embedded("products on pixels"))
+    sampled.write_sampled_beams(path, made)
     order = np.random.default_rng(0).permutation(16)
     with xr.open_dataset(path, engine="h5netcdf") as file:
         shuffled = file.load().isel(product=order)
     shuffled.attrs["products"] = ", ".join(labels()[k] for k in order)
     shuffled.to_netcdf(path, engine="h5netcdf")
-    np.testing.assert_array_equal(read_beam(path).products, made.products)
+    np.testing.assert_array_equal(sampled.read_beam(path).products, made.products)
     shuffled.attrs["products"] = "00R, 01R"
     shuffled.to_netcdf(path, engine="h5netcdf")
-    refuse(r"mine\.nc.*products.*00R, 01R.*names", read_beam, path)
+    refuse(r"mine\.nc.*products.*00R, 01R.*names", sampled.read_beam, path)
 
 
 @pytest.mark.parametrize("kind", ["pixels", "grid"])
@@ -228,27 +222,27 @@ NO_BEAMS = [
 
 @pytest.mark.parametrize(("given", "words"), NO_BEAMS)
 def test_arrays_that_are_no_beams_are_refused(given, words):
-    refuse(words, sampled_beams, FREQUENCY, **given())
+    refuse(words, sampled.sampled_beams, FREQUENCY, **given())
 
 
 def test_what_cannot_be_computed_is_refused():
-    zero = sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
+    zero = sampled.sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
     refuse("autos integrate to 0 sr", zero.beams, FREQUENCY, 2)
     refuse("needs the E fields", zero.fields, FREQUENCY, HemisphereGrid.for_lmax(2))
     two = np.zeros((2, 16, 48))
-    refuse("frequency_mhz does not increase", sampled_beams, [20.0, 10.0], products=two)
+    refuse("frequency_mhz does not increase", sampled.sampled_beams, [20.0, 10.0], products=two)
 
 
 @pytest.mark.parametrize("suffix", ["nc", "fits"])
 def test_a_file_has_to_say_whether_its_scale_is_absolute(tmp_path, suffix):
-    path, made = tmp_path / f"mine.{suffix}", sampled_beams(FREQUENCY, **embedded("grid"))
-    write_sampled_beams(path, made)
+    path, made = tmp_path / f"mine.{suffix}", sampled.sampled_beams(FREQUENCY, **embedded("grid"))
+    sampled.write_sampled_beams(path, made)
     if suffix == "fits":
         fits.delval(path, "ABSOLUTE")
     else:
         with h5py.File(path, "r+") as file:
             del file.attrs["absolute"]
-    refuse(str(path), read_beam, path)
+    refuse(str(path), sampled.read_beam, path)
 
 
 # --- pyuvdata -------------------------------------------------------------------------------------
@@ -264,10 +258,10 @@ def uvbeam(coordinates: str):
     options |= {"feed_version": "1", "model_version": "1"}
     if coordinates == "healpix":
         options |= {"nside": NSIDE}
-        given = [on_pixels(Monopoles(), f) for f in (20.0, 30.0)]
+        given = [on_pixels(monopoles.Monopoles(), f) for f in (20.0, 30.0)]
     else:
         options |= {"axis1_array": np.radians(PHI_DEG), "axis2_array": np.radians(THETA_DEG)}
-        given = [on_grid(Monopoles(), f) for f in (20.0, 30.0)]
+        given = [on_grid(monopoles.Monopoles(), f) for f in (20.0, 30.0)]
     # (vector: along phi, along theta; feed; frequency; directions)
     along = [[one[name][:2] for one in given] for name in ("e_phi", "e_theta")]
     options["data_array"] = np.stack([np.stack(one, axis=1) for one in along])
@@ -279,17 +273,17 @@ def uvbeam(coordinates: str):
 def test_a_uvbeam_is_its_fields(tmp_path, coordinates):
     beam = uvbeam(coordinates)
     expected = np.asarray(lb.monopole_beams(20.0, LMAX).modes)[[0, 1, 2, 7]]
-    found = from_uvbeam(beam)
+    found = sampled.from_uvbeam(beam)
     assert found.n_ports == 2
     path = tmp_path / "uv.fits"
     beam.write_beamfits(str(path))
     scenario = small_scenario(f"beam.file={path}")
     for made in (found.beams(20.0, LMAX), scenario.beam.source().beams(20.0, LMAX)):
         assert np.abs(made.modes - expected).max() < SPLINES * np.abs(expected).max()
-    conjugate = from_uvbeam(beam, conjugate=True).beams(20.0, LMAX).modes
+    conjugate = sampled.from_uvbeam(beam, conjugate=True).beams(20.0, LMAX).modes
     np.testing.assert_allclose(conjugate[2], -found.beams(20.0, LMAX).modes[2], atol=1e-15)
     beam.efield_to_power()
-    refuse("give one of type efield", from_uvbeam, beam)
+    refuse("give one of type efield", sampled.from_uvbeam, beam)
 
 
 def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, monkeypatch):
@@ -297,4 +291,4 @@ def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, m
     hdu.header["NORMSTD"], hdu.header["FEEDLIST"] = "physical", "[x, y]"
     hdu.writeto(path)
     monkeypatch.setattr("lusee_bayes.instrument.beams.sampled.find_spec", lambda name: None)
-    refuse(r"pip install '\.\[uvdata\]'", read_beam, path)
+    refuse(r"pip install '\.\[uvdata\]'", sampled.read_beam, path)

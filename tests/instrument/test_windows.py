@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 import xarray as xr
-from assertions import refuse, refused, within
+from assertions import assert_same, refuse, refused, within
 from astropy.time import Time
 from reference import galactic_directions, steep_sky, vectors
 
@@ -355,9 +355,8 @@ def data():
 
 def test_windows_come_back_to_the_last_bit(data, tmp_path):
     again = read_visibilities(data.write(tmp_path / "data.nc"))
-    for name in ("sample", "start_s", "end_s", "live_s"):
-        there, here = (getattr(d.observation.windows, name) for d in (data, again))
-        np.testing.assert_array_equal(here, there)
+    windows = (one.observation.windows for one in (again, data))
+    assert_same(*windows, "sample", "start_s", "end_s", "live_s")
     assert again.says_window and again.digest() == data.digest()
 
 

@@ -309,9 +309,11 @@ def scores_of(hyperprior, theta, covariance) -> learning.Scores:
     return learning.Scores(z, covariance / slope[:, None] / slope, 0.0)
 
 
-@pytest.fixture(scope="module")
-def one_parameter():
-    """Modes that are seen with noise from a tenth to ten times their strength; theta = 0.4 +- 1."""
+def test_draws_are_those_of_the_integral_over_the_parameter():
+    """Every mode: the distribution function at some points, by quadrature over theta.
+
+    Modes are seen with noise from a tenth to ten times their strength; theta = 0.4 +- 1.
+    """
     family, width = Strength(np.ones((LOW + 1, 1)), PRIOR), 1.0
     noise = np.geomspace(0.1, 10.0, SIZE) * SCALE
     seen, unknown = 2.0 * SCALE * np.ones(SIZE), [np.asarray(0.0)] * 3
@@ -321,12 +323,6 @@ def one_parameter():
     scores = scores_of(family.hyperprior, theta, covariance)
     learned = learning.Learned(prior, theta, covariance, scores, 0.0)
     draws = learning.draws_with_parameters(family, learned, information, jax.random.key(1), 4500)
-    return noise, seen, draws
-
-
-def test_draws_are_those_of_the_integral_over_the_parameter(one_parameter):
-    """Every mode: the distribution function at some points, by quadrature over theta."""
-    noise, seen, draws = one_parameter
     assert draws.shape == (4500, SIZE)
 
     theta = np.linspace(-6.0, 7.0, 2001)

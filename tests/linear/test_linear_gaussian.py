@@ -15,8 +15,7 @@ from scipy.stats import multivariate_normal
 import lusee_bayes as lb
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.amplitudes import template_amplitudes, variance_factor
-from lusee_bayes.linear.information import CONVERGENCE
+from lusee_bayes.linear import amplitudes, information
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap, form_of
 from lusee_bayes.noise.covariance import DenseCovariance, LowRankCovariance
 from lusee_bayes.noise.time_blocks import TimeBlockCovariance
@@ -223,7 +222,7 @@ def test_high_signal_to_noise_to_sixty_digits(form, n_data, largest):
     assert np.abs((np.asarray(post.mean) - exact.mean) / exact.std).max() < refined
     assert np.abs(np.asarray(post.std()) / exact.std - 1.0).max() < lost
     assert float(post.log_evidence) == pytest.approx(exact.log_prob, abs=10 * lost)
-    assert float(post.refinement) <= CONVERGENCE
+    assert float(post.refinement) <= information.CONVERGENCE
 
 
 def test_refinement_is_needed_and_reported():
@@ -235,7 +234,7 @@ def test_refinement_is_needed_and_reported():
     u = np.linalg.solve(lower.T, np.linalg.solve(lower, np.asarray(pulled)))
     unrefined = u * np.sqrt(per_mode(np.asarray(model.prior.spectrum)))
     assert np.abs((unrefined - exact.mean) / exact.std).max() > PROMISED
-    assert 0.0 <= float(model.condition(d, InMap).posterior.refinement) <= CONVERGENCE
+    assert 0.0 <= float(model.condition(d, InMap).posterior.refinement) <= information.CONVERGENCE
 
 
 @pytest.mark.parametrize("n_data", [30, 9])
@@ -391,12 +390,12 @@ def test_the_variance_of_columns_is_where_the_density_of_data_is_largest(size):
     data = signal + np.sqrt(np.diag(noise)) * rng.normal(size=n)
     base = lb.DiagonalCovariance(jnp.asarray(np.diag(noise))) + LowRankCovariance(jnp.asarray(u))
     model = lb.LinearGaussian(jnp.asarray(a), lb.HarmonicPrior(jnp.asarray(SPECTRUM)), base)
-    found = template_amplitudes(model.condition(jnp.asarray(data)), u)
+    found = amplitudes.template_amplitudes(model.condition(jnp.asarray(data)), u)
     factors, known = np.exp(np.linspace(-2.9, 2.9, 101)), a @ s @ a.T + noise
     tried = [multivariate_normal.logpdf(data, cov=known + f * u @ u.T) for f in factors]
     for std in (0.3, 10.0):
         best = int(np.argmax(np.array(tried) - 0.5 * (np.log(factors) / std) ** 2))
-        assert factors[best - 1] < variance_factor(found, std) < factors[best + 1]
+        assert factors[best - 1] < amplitudes.variance_factor(found, std) < factors[best + 1]
     # twelve columns tell their variance to 40 %; a narrow prior keeps it near one
-    assert 0.4 < variance_factor(found, 10.0) / size**2 < 2.5
-    assert abs(np.log(variance_factor(found, 0.3) / size**2)) > 0.1
+    assert 0.4 < amplitudes.variance_factor(found, 10.0) / size**2 < 2.5
+    assert abs(np.log(amplitudes.variance_factor(found, 0.3) / size**2)) > 0.1

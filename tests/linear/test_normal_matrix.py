@@ -15,8 +15,7 @@ from lusee_bayes.instrument.averaging import windowed
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear import information
-from lusee_bayes.linear.linear_gaussian import FromInformation, InMap, form_of
+from lusee_bayes.linear import information, linear_gaussian
 from lusee_bayes.linear.normal_matrix import CHUNK, normal_matrix, summed, time_sums
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.noise import covariance as cov
@@ -150,8 +149,8 @@ NOISES = ["diagonal", *(pytest.param(k, marks=pytest.mark.long) for k in ("offse
 def test_information_gives_the_posterior_of_the_dense_form(kind):
     gaussian, rng = model(kind), np.random.default_rng(11)
     data = jnp.asarray(rng.standard_normal(gaussian.n_data))
-    expected = gaussian.condition(data, form=InMap).posterior
-    solution = gaussian.condition(data, FromInformation)
+    expected = gaussian.condition(data, form=linear_gaussian.InMap).posterior
+    solution = gaussian.condition(data, linear_gaussian.FromInformation)
     found = solution.information
     for posterior in (solution.posterior, found.posterior(gaussian.prior)):
         np.testing.assert_allclose(posterior.mean, expected.mean, rtol=0, atol=1e-11)
@@ -175,9 +174,9 @@ def test_inside_a_transformation_the_form_is_one_in_jax():
 def test_the_matrix_is_not_formed_where_there_is_structure(kind, monkeypatch):
     gaussian = model(kind)
     data = jnp.asarray(np.random.default_rng(2).standard_normal(gaussian.n_data))
-    expected = np.asarray(gaussian.condition(data, InMap).posterior.mean)
+    expected = np.asarray(gaussian.condition(data, linear_gaussian.InMap).posterior.mean)
     monkeypatch.setattr(lb.CouplingMatrix, "dense", None)
-    assert form_of(gaussian) is FromInformation
+    assert linear_gaussian.form_of(gaussian) is linear_gaussian.FromInformation
     got = gaussian.condition(data).posterior.mean
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11)
 

@@ -24,7 +24,6 @@ from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs.channels import map_channels
 from lusee_bayes.sampling.datatree import read_datatree
-from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sky.sky_source import SkyCube
 from lusee_bayes.systematics.context import Around
 
@@ -269,10 +268,9 @@ def test_sampled_unknowns_beside_joint_skies_are_those_of_the_map(tmp_path):
     that each channel learns from the others."""
     common = "noise.receiver={power_k: 2000, relative_std: 0.2, smooth_octaves: 1.0}"
     noisy = common, "noise.radiometer.factor=1e4", "joint=true", "lmax=3"
-    scenario = three(*noisy, "spectral.components=[power_law]")
-    lb.run_map(scenario, tmp_path / "map")
+    lb.run_map(three(*noisy, "spectral.components=[power_law]"), tmp_path / "map")
     sampled = three(*noisy, "spectral.components=[power_law]", "noise.receiver.treatment=sampled")
-    sampler = Sampler(chains=4, draws=500, warmup=200, seed=1)
+    sampler = lb.Sampler(chains=4, draws=500, warmup=200, seed=1)
     drawn = lb.run_sample(sampled, tmp_path / "draws", sampler=sampler).result
     found, table = posterior_of(tmp_path / "map"), table_of(tmp_path / "map" / "unknowns.csv")
     assert (drawn[0].tree["constant_data"]["analytic_std"].values / found["std"][0]).mean() > 1.3

@@ -153,9 +153,8 @@ def test_sessions_without_a_number_are_refused(simulated, tmp_path, capsys):
     assert "NaN" in said and not out.exists()
 
 
-def test_info_of_several_files_names_the_bad_one_and_shows_the_others(simulated, tmp_path, capsys):
-    bad = tmp_path / "bad.h5"
-    bad.write_text("nothing")
+def test_info_of_several_files_names_the_bad_one_and_shows_the_others(simulated, write, capsys):
+    bad = write("nothing", "bad.h5")
     good = [simulated / "session_000.h5", simulated / "gains.nc"]
     assert run("info", good[0], bad, good[1]) == 2
     told = capsys.readouterr()
@@ -190,14 +189,11 @@ def page_of(reduced, folder):
 def test_the_section_says_how_spectra_were_reduced(reduced, tmp_path):
     page = page_of(reduced, tmp_path)
     for told in (
-        "gains.nc (netCDF)",
-        "the centre of channel k is at k times 25 kHz",
-        "middle of integrations",
-        "polynomial of degree 2 over 1 MHz",
-        "longitude 182.258°, latitude -23.814°, of the sessions",
-        "0x307",
+        "gains.nc (netCDF)", "the centre of channel k is at k times 25 kHz",
+        "middle of integrations", "polynomial of degree 2 over 1 MHz",
+        "longitude 182.258°, latitude -23.814°, of the sessions", "0x307",
         "UTC, from the clock file",
-    ):
+    ):  # fmt: skip
         assert told in page, told
 
 

@@ -29,8 +29,7 @@ from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.runs import sample_run
 from lusee_bayes.runs.sample_run import sample_together
-from lusee_bayes.sampling import hmc
-from lusee_bayes.sampling.datatree import read_datatree
+from lusee_bayes.sampling import datatree, hmc
 from lusee_bayes.sampling.hmc import CHUNK
 
 ROOT = Path(lb.__file__).resolve().parents[1]
@@ -108,7 +107,7 @@ def experiment():
 
 @pytest.fixture(scope="module")
 def tree(runs):
-    return read_datatree(runs[0] / "samples.nc")
+    return datatree.read_datatree(runs[0] / "samples.nc")
 
 
 @pytest.fixture
@@ -160,7 +159,7 @@ def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(killed, tree, m
     assert run("sample", *SMALL, *SETTINGS, "-q", "-o", killed, "--resume") == 0
     assert written == list(range(max(before) + CHUNK, SAMPLER.warmup + SAMPLER.draws + 1, CHUNK))
     assert all(untouched)
-    assert_same_trees(read_datatree(killed / "samples.nc"), tree)
+    assert_same_trees(datatree.read_datatree(killed / "samples.nc"), tree)
     assert not (killed / "chains").exists()
     assert not list(killed.glob(".partial*"))
 
@@ -200,7 +199,7 @@ def test_resuming_a_finished_run_takes_it_over(whole, tree, no_sampling):
     before = content(whole)
     summary = pd.read_csv(whole / "summary.csv", index_col="quantity")
     assert run("sample", *SMALL, *SETTINGS, "-q", "-o", whole, "--resume") == 0
-    assert_same_trees(read_datatree(whole / "samples.nc"), tree)
+    assert_same_trees(datatree.read_datatree(whole / "samples.nc"), tree)
     assert set(content(whole)) == set(before)
     # draws that lie in memory in another order are summed in another order
     again = pd.read_csv(whole / "summary.csv", index_col="quantity")
@@ -310,13 +309,12 @@ def model(coupling, offset, prior, noise, data=None):
 
 
 @pytest.mark.parametrize("program", ["sky_marginal", "prior_amplitude", "plated"])
-def test_programs_without_the_sky_get_their_maps_too(program, tmp_path):
-    out, own = tmp_path / "out", tmp_path / "plated.py"
-    own.write_text(PLATED)
-    given = own if program == "plated" else program
+def test_programs_without_the_sky_get_their_maps_too(program, tmp_path, write):
+    out = tmp_path / "out"
+    given = write(PLATED, "plated.py") if program == "plated" else program
     arguments = ["--model", given, "--draws", "150", "--warmup", "100", "--chains", "2"]
     assert run("sample", *SMALL, *arguments, "-q", "-o", out) == 0
-    tree = read_datatree(out / "samples.nc")
+    tree = datatree.read_datatree(out / "samples.nc")
     assert set(tree.children) == GROUPS
     others = set(tree["posterior"].data_vars) - {"sky"}
     expected = {"sky_marginal": {"noise_level"}, "prior_amplitude": {"amplitude", "tilt"}}

@@ -17,8 +17,7 @@ from small_models import random_gaussian
 import lusee_bayes as lb
 from lusee_bayes.core import formats
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.sampling.datatree import read_datatree, to_datatree
-from lusee_bayes.sampling.hmc import STATISTICS, Chains
+from lusee_bayes.sampling import datatree, hmc
 
 # two antennas, so four products
 PRODUCTS, N_TIMES, N_MODES = ("00R", "01R", "01I", "11R"), 4, 9
@@ -47,14 +46,14 @@ def exact(setting):
 
 def chains_of(sites):
     rng, shape = np.random.default_rng(0), next(iter(sites.values())).shape[:2]
-    statistics = {name: rng.random(shape) for name in STATISTICS}
-    return Chains(sites, statistics | {"diverging": rng.random(shape) > 0.5})
+    statistics = {name: rng.random(shape) for name in hmc.STATISTICS}
+    return hmc.Chains(sites, statistics | {"diverging": rng.random(shape) > 0.5})
 
 
 def tree_of(setting, chains, program="sky", **options):
     model, data = setting
     posterior = model.condition(data.data).posterior
-    return to_datatree(chains, lb.load_program(program), model, posterior, data, **options)
+    return datatree.to_datatree(chains, lb.load_program(program), model, posterior, data, **options)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +79,7 @@ def test_every_group_is_there_with_its_dimensions(drawn, setting):
     draws, known = ("chain", "draw"), ("prior_std", "analytic_mean", "analytic_std", "truth")
     expected = {
         "posterior": {"sky": (*draws, "mode")},
-        "sample_stats": dict.fromkeys(STATISTICS, draws),
+        "sample_stats": dict.fromkeys(hmc.STATISTICS, draws),
         "prior": {"sky": (*draws, "mode")},
         "prior_predictive": {"data": (*draws, "datum")},
         "posterior_predictive": {"data": (*draws, "datum")},
@@ -134,7 +133,7 @@ def test_units_are_written_on_what_has_them(drawn):
     tree, _ = drawn
     for group in tree.children.values():
         for name, values in group.data_vars.items():
-            assert values.attrs.get("units") == ("1" if name in STATISTICS else "K"), name
+            assert values.attrs.get("units") == ("1" if name in hmc.STATISTICS else "K"), name
 
 
 def test_constants_against_the_textbook(drawn, setting, exact):
@@ -176,7 +175,7 @@ def test_predictive_groups_are_thinned_and_know_which_draws_they_belong_to(setti
     # noise a million times smaller than the sky tells which sky the data belong to
     quiet = lb.LinearGaussian(model.coupling, model.prior, model.noise.scaled(1e-12))
     arguments = (lb.load_program("sky"), quiet, posterior, data)
-    tree = to_datatree(chains_of({"sky": skies}), *arguments, n_predictive=10)
+    tree = datatree.to_datatree(chains_of({"sky": skies}), *arguments, n_predictive=10)
     predicted = tree["posterior_predictive"]
     np.testing.assert_array_equal(predicted["draw"], [0, 12, 24])
     assert predicted.sizes["chain"] == 4
@@ -185,7 +184,7 @@ def test_predictive_groups_are_thinned_and_know_which_draws_they_belong_to(setti
     # noise of 1e-6 times some units
     np.testing.assert_allclose(predicted["data"], expected, atol=1e-5)
     assert tree["prior"].sizes["draw"] == 10
-    few = to_datatree(chains_of({"sky": skies[:, :5]}), *arguments, n_predictive=30)
+    few = datatree.to_datatree(chains_of({"sky": skies[:, :5]}), *arguments, n_predictive=30)
     np.testing.assert_array_equal(few["posterior_predictive"]["draw"], np.arange(5))
 
 
@@ -247,7 +246,7 @@ def test_data_of_a_program_without_the_sky_are_replicated_with_its_skies(collaps
 def test_a_written_tree_comes_back(which, request, tmp_path):
     tree, _ = request.getfixturevalue(which)
     tree.to_netcdf(tmp_path / "samples.nc", engine="h5netcdf")
-    found = read_datatree(tmp_path / "samples.nc")
+    found = datatree.read_datatree(tmp_path / "samples.nc")
     xr.testing.assert_identical(found, tree)
     for path, group in tree.subtree_with_keys:
         for name, values in group.data_vars.items():
@@ -286,4 +285,4 @@ def test_files_that_are_no_samples_are_refused(setting, drawn, tmp_path):
         ("cut.nc", "cannot be read as HDF5"),
         (".", "is a folder; give a file: samples"),
     ]:
-        refuse(message, read_datatree, tmp_path / name)
+        refuse(message, datatree.read_datatree, tmp_path / name)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import failed
 from small_models import noisy
 
 import lusee_bayes as lb
@@ -58,10 +59,6 @@ class Witness:
         noise = DenseCovariance(jnp.asarray(self.model.noise.dense()))
         model = lb.LinearGaussian(self.model.coupling.dense(), prior, noise)
         return model.condition(self.data.data, InMap).posterior
-
-
-def failed(found: Comparison) -> set[str]:
-    return {check.name for check in found.checks if not check.passed}
 
 
 @pytest.mark.long

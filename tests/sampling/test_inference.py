@@ -144,22 +144,13 @@ def noisy_sky(coupling, prior, scale, data=None):
     numpyro.sample("data", noise, obs=data)
 
 
-@pytest.fixture(scope="module")
-def level_grid():
-    """Midpoints in ln level: steps of 0.02 over six sigmas of the prior; sums of smooth functions
-    that vanish at both ends are exact to rounding then."""
-    return np.arange(-4.2, 4.2, 0.02)
-
-
-def by_quadrature(gaussian, data, noise, logs):
-    """Weights of each ln level, and the sky's posterior given it."""
-    a, s, _ = matrices(gaussian)
-    given = [naive_posterior(a, s, np.exp(x) * noise, data) for x in logs]
-    return np.array([answer.log_prob for answer in given]), given
+# midpoints in ln level: steps of 0.02 over six sigmas of the prior; sums of smooth functions that
+# vanish at both ends are exact to rounding then
+LEVELS = np.arange(-4.2, 4.2, 0.02)
 
 
 @pytest.mark.long
-def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_grid):
+def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data):
     """Against quadrature over the level: p(level | d), and the sky's mean and second moments."""
     whitening = lb.Whitening.of(gaussian.condition(data).posterior)
     given = {"coupling": gaussian.coupling, "prior": gaussian.prior, "scale": jnp.asarray(0.7)}
@@ -169,14 +160,17 @@ def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_
     sky, level = chains.sites["sky"], chains.sites["level"]
     # a sum of nine numbers in another order: rounding
     np.testing.assert_allclose(chains.sites["mean_sky"], sky.mean(-1), rtol=1e-12, atol=1e-13)
-    log_p, given = by_quadrature(gaussian, data, 0.49 * np.eye(N_DATA), level_grid)
-    weights = np.exp(log_p - 0.5 * (level_grid / 0.7) ** 2)
+    # weights of each ln level, and the sky's posterior given it
+    a, s, _ = matrices(gaussian)
+    given = [naive_posterior(a, s, np.exp(x) * 0.49 * np.eye(N_DATA), data) for x in LEVELS]
+    log_p = np.array([answer.log_prob for answer in given])
+    weights = np.exp(log_p - 0.5 * (LEVELS / 0.7) ** 2)
     weights /= weights.sum()
     mean = weights @ np.stack([g.mean for g in given])
     about = [g.covariance + np.outer(g.mean - mean, g.mean - mean) for g in given]
     covariance = np.einsum("g,gij->ij", weights, np.stack(about))
     logs = np.log(level)[..., None]
-    expected = [weights @ level_grid, weights @ level_grid**2]
+    expected = [weights @ LEVELS, weights @ LEVELS**2]
     assert_mean(np.concatenate([logs, logs**2], -1), np.array(expected), "level")
     std = np.sqrt(np.diag(covariance))
     scaled = (sky - mean) / std
@@ -188,21 +182,21 @@ def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_
 
 @pytest.mark.long
 @pytest.mark.parametrize("algorithm", ["nuts", "hmc"])
-def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, algorithm):
+def test_the_marginal_program_finds_the_noise_level(gaussian, data, algorithm):
     """No site in white coordinates; p(level | d) by quadrature over scipy's evidence."""
     a, s, n = matrices(gaussian)
     sampler = Sampler(chains=4, warmup=300, draws=1000, algorithm=algorithm)
     arguments = arguments_of(gaussian, data, "sky_marginal")
     chains = sample(lb.load_program("sky_marginal").model, arguments, sampler)
     assert set(chains.sites) == {"noise_level"}
-    levels = np.exp(level_grid)
+    levels = np.exp(LEVELS)
     laws = [multivariate_normal(cov=a @ s @ a.T + level * n) for level in levels]
     evidence = [law.logpdf(np.asarray(data)) for law in laws]
     # the density of ln level: the Jacobian is the level itself
     density = np.exp(np.array(evidence)) * lognorm(1.0).pdf(levels) * levels
     density /= density.sum()
     logs = np.log(chains.sites["noise_level"])[..., None]
-    expected = [density @ level_grid, density @ level_grid**2]
+    expected = [density @ LEVELS, density @ LEVELS**2]
     assert_mean(np.concatenate([logs, logs**2], -1), np.array(expected), "ln noise level")
 
 

@@ -16,8 +16,7 @@ from scipy.stats import multivariate_normal, norm
 import lusee_bayes as lb
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.amplitudes import Amplitudes
-from lusee_bayes.sampling import hmc, programs
-from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel
+from lusee_bayes.sampling import hmc, programs, shared_sites
 from lusee_bayes.systematics.systematic import Unknown
 
 FREQUENCIES = {"10MHz": 10.0, "18MHz": 18.0, "40MHz": 40.0}
@@ -39,7 +38,7 @@ CHANNELS = {name: {"mean": mean} for name, mean in MEANS.items()}
 
 @pytest.mark.parametrize("octaves", [0.7, 1.5])
 def test_the_density_is_that_of_all_channels_at_once(octaves):
-    shared = SharedSites(program, FREQUENCIES, {"common": np.inf, "smooth": octaves})
+    shared = shared_sites.SharedSites(program, FREQUENCIES, {"common": np.inf, "smooth": octaves})
     rng = np.random.default_rng(1)
     common, smooth, own = 1.4, rng.normal(list(MEANS.values()), 0.3), rng.normal(size=3)
     sites = {"10MHz/common": common}
@@ -59,7 +58,7 @@ def test_the_density_is_that_of_all_channels_at_once(octaves):
 
 def test_what_is_nearly_the_same_has_no_site_of_its_own():
     """Over 1e6 octaves the variance that is left is below rounding: one site, scaled."""
-    shared = SharedSites(program, FREQUENCIES, {"smooth": 1e6})
+    shared = shared_sites.SharedSites(program, FREQUENCIES, {"smooth": 1e6})
     with programs.numpyro_promotion():
         trace = handlers.trace(handlers.seed(shared, jax.random.key(0))).get_trace(CHANNELS, DATA)
     z = [float(trace[f"{c}/smooth"]["value"] / m - 1.0) / 0.1 for c, m in MEANS.items()]
@@ -70,7 +69,7 @@ def test_what_is_nearly_the_same_has_no_site_of_its_own():
 
 def test_a_channel_has_its_own_names():
     chains = hmc.Chains({"10MHz/sky": np.ones(1), "18MHz/sky": np.zeros(1)}, {"lp": np.zeros(1)})
-    assert of_channel(chains, "18MHz").sites == {"sky": np.zeros(1)}
+    assert shared_sites.of_channel(chains, "18MHz").sites == {"sky": np.zeros(1)}
 
 
 @pytest.mark.parametrize("octaves", [0.7, 1e6])
@@ -97,7 +96,7 @@ def test_coordinates_are_those_of_the_gaussian_given_all_channels(octaves):
     mean = expected @ pulled
     few = ["10MHz/smooth"] if octaves > 1.0 else [f"{name}/smooth" for name in FREQUENCIES]
     latent = ["10MHz/common", *few, *(f"{name}/own" for name in FREQUENCIES)]
-    white = gaussian_of_sites(known, unknowns, FREQUENCIES, shared, latent)
+    white = shared_sites.gaussian_of_sites(known, unknowns, FREQUENCIES, shared, latent)
     assert sorted(white.names) == sorted(latent)
     at = {
         f"{name}/{u}": 4 * k + j

@@ -6,7 +6,7 @@ Draws are made by numpy, with the textbook's dense mean and covariance, not by t
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import refuse
+from assertions import failed, refuse
 from scipy import linalg, stats
 
 import lusee_bayes as lb
@@ -74,10 +74,6 @@ def wrong_posterior(mean: np.ndarray, covariance: np.ndarray) -> Posterior:
 def judge(draws, energy, posterior, diverging=None, seed=0):
     diverging = np.zeros(energy.shape, bool) if diverging is None else diverging
     return validate_draws(draws, posterior, diverging, energy, seed=seed)
-
-
-def failed(found) -> set[str]:
-    return {check.name for check in found.checks if not check.passed}
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,7 @@ from lusee_bayes.core.harmonics import n_modes, per_mode, pixel_matrix, synthesi
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.judge.residuals import residuals
-from lusee_bayes.priors.families import Hyperprior, IsotropicFamily, PriorFamily
-from lusee_bayes.priors.local_scales import embedded_local_scales, windows
+from lusee_bayes.priors import families, local_scales
 from lusee_bayes.sky.prior import DensePrior, IndependentPrior
 from lusee_bayes.testing import check_prior
 
@@ -33,11 +32,6 @@ def pixel_covariance() -> np.ndarray:
     cosine = np.clip(vectors.T @ vectors, -1.0, 1.0)
     terms = ((2 * k + 1) * c * eval_legendre(k, cosine) for k, c in enumerate(SPECTRUM))
     return sum(terms) / (4 * np.pi)
-
-
-@pytest.fixture(scope="module")
-def harmonic():
-    return lb.HarmonicPrior(jnp.asarray(SPECTRUM))
 
 
 def dense_covariance() -> np.ndarray:
@@ -101,12 +95,12 @@ def test_what_no_prior_is_is_refused():
     refuse("the prior mean has shape", harmonic, spectrum[:2], mean=MEAN)
 
 
-def test_pixels_of_an_isotropic_sky_are_those_of_the_addition_theorem(harmonic):
+def test_pixels_of_an_isotropic_sky_are_those_of_the_addition_theorem():
     rng, y = np.random.default_rng(3), pixel_matrix(NSIDE, LMAX)
     np.testing.assert_allclose(y * PER_MODE @ y.T, pixel_covariance(), atol=1e-14)
     a, d, variance = rng.normal(size=(24, 16)), rng.normal(size=24), rng.uniform(0.5, 2.0, 24)
-    noise = lb.DiagonalCovariance(jnp.asarray(variance))
-    found = lb.LinearGaussian(jnp.asarray(a), harmonic, noise).condition(jnp.asarray(d)).posterior
+    prior, noise = lb.HarmonicPrior(SPECTRUM), lb.DiagonalCovariance(jnp.asarray(variance))
+    found = lb.LinearGaussian(jnp.asarray(a), prior, noise).condition(jnp.asarray(d)).posterior
     # A Y^+ sees a sky of pixels; numbers of order one, and a posterior of condition below 1e3
     naive = posterior(a @ np.linalg.pinv(y), pixel_covariance(), np.diag(variance), d)
     np.testing.assert_allclose(y @ np.asarray(found.mean), naive.mean, atol=1e-12)
@@ -161,8 +155,8 @@ FAMILY_LMAX = 5
 
 
 MAKE = {
-    "isotropic": lambda lmax: IsotropicFamily.around(2e4, lmax),
-    "local scales": lambda lmax: embedded_local_scales(25.0, lmax),
+    "isotropic": lambda lmax: families.IsotropicFamily.around(2e4, lmax),
+    "local scales": lambda lmax: local_scales.embedded_local_scales(25.0, lmax),
 }
 
 
@@ -177,7 +171,7 @@ def family(made):
     return made[0]
 
 
-def somewhere(family: PriorFamily) -> np.ndarray:
+def somewhere(family: families.PriorFamily) -> np.ndarray:
     """Parameters away from the centre."""
     start = family.hyperprior.start()
     return start + 0.3 * np.random.default_rng(3).standard_normal(len(start))
@@ -219,7 +213,7 @@ def test_priors_of_a_family_have_its_covariance(family):
 
 def test_the_texture_is_filtered_white_noise():
     """R sum_j w_j Y^T diag(area v_j) Y w_j R, with dense harmonics at the grid's points."""
-    family = embedded_local_scales(25.0, FAMILY_LMAX)
+    family = local_scales.embedded_local_scales(25.0, FAMILY_LMAX)
     member = family.at(somewhere(family))
     expected = np.zeros((n_modes(FAMILY_LMAX),) * 2)
     for band, strength in zip(family.bands, member.strengths, strict=True):
@@ -232,7 +226,7 @@ def test_the_texture_is_filtered_white_noise():
 
 @pytest.mark.parametrize("lmax", [1, 2, 5, 31, 47])
 def test_windows_share_every_ell(lmax):
-    found = windows(lmax)
+    found = local_scales.windows(lmax)
     np.testing.assert_allclose((found**2).sum(0)[1:], 1.0, rtol=1e-14)
     assert (found[:, 0] == 0.0).all()
 
@@ -252,13 +246,13 @@ def test_the_diagonal_on_a_grid():
 
 def test_the_hyperprior_is_a_density():
     """It integrates to one over a parameter and over a cell, and its gradient is its own."""
-    theta = Hyperprior(np.array([-2.7]), np.array([0.2]))
+    theta = families.Hyperprior(np.array([-2.7]), np.array([0.2]))
     total, _ = quad(lambda x: np.exp(theta.log_density(np.array([x]))), -np.inf, np.inf)
     assert total == pytest.approx(1.0, rel=1e-6)
-    cell = Hyperprior(np.zeros(0), np.zeros(0), 1)
+    cell = families.Hyperprior(np.zeros(0), np.zeros(0), 1)
     total, _ = quad(lambda x: np.exp(cell.log_density(np.array([x]))), -8.0, 60.0, limit=200)
     assert total == pytest.approx(1.0, rel=1e-6)
-    both = Hyperprior(np.array([1.0, -2.0]), np.array([0.5, 2.0]), 2)
+    both = families.Hyperprior(np.array([1.0, -2.0]), np.array([0.5, 2.0]), 2)
     at = np.array([1.4, -5.0, -0.3, 2.0])
     for i in range(4):
         step = np.zeros(4)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.core.linalg import main_directions
+from lusee_bayes.core import harmonics, linalg
 from lusee_bayes.experiment.experiment import observed
 from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate, true_signal
 from lusee_bayes.instrument.visibilities import read_visibilities
@@ -57,7 +56,7 @@ def test_integrated_out_is_the_marginal_of_the_posterior_of_all_modes(both, monk
 def test_a_file_of_simulated_data_says_that_the_sky_does_not_end_at_lmax(both, tmp_path):
     lb.run_simulate(both[0], tmp_path / "data.nc")
     data = read_visibilities(tmp_path / "data.nc")
-    assert len(data.truth) == n_modes(LMAX + MARGIN)
+    assert len(data.truth) == harmonics.n_modes(LMAX + MARGIN)
     seen = observed(both[0], data)
     assert seen.scenario.noise.above_lmax is not None and len(seen.data.truth) == N
 
@@ -87,7 +86,7 @@ def test_beams_that_end_before_leave_a_map_and_a_doubt(monkeypatch):
 @pytest.mark.parametrize("rows", [500, 700])
 def test_main_directions_leave_out_as_little_as_singular_vectors(rows):
     white = np.random.default_rng(1).standard_normal((rows, 600)) * np.geomspace(30.0, 1e-4, 600)
-    found = main_directions(white.T @ white, 1.0)
+    found = linalg.main_directions(white.T @ white, 1.0)
     np.testing.assert_allclose(found.T @ found, np.eye(found.shape[1]), atol=1e-9)
     left = np.vdot(white, white) - np.vdot(white @ found, white @ found)
     beyond = np.cumsum(np.linalg.svd(white)[1][::-1] ** 2)

@@ -17,8 +17,7 @@ from lusee_bayes.experiment.model import base_model, radiometer, set_up, simulat
 from lusee_bayes.instrument.beams import fields as beam_fields
 from lusee_bayes.instrument.beams.fields import AntennaFields, HemisphereGrid, stokes_beam
 from lusee_bayes.instrument.products import to_real
-from lusee_bayes.results.finished_runs import FinishedRun
-from lusee_bayes.results.summaries import MapSummary
+from lusee_bayes.results import finished_runs, summaries
 from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.field_errors import STD, FieldErrors, FieldErrorsSection, of_ell
 
@@ -163,7 +162,7 @@ def test_a_report_has_the_share_of_the_variance_that_they_add(tmp_path):
         rest = np.concatenate([columns for other, columns in of.items() if other != name], axis=1)
         n = np.diag(np.asarray(noise)) + rest @ rest.T
         left[name] = np.linalg.inv(a.T @ np.linalg.solve(n, a) + inverse)
-    channel = FinishedRun.read(run.folder).channel
+    channel = finished_runs.FinishedRun.read(run.folder).channel
     theta = channel.theta
     expected = {name: 1.0 - np.trace(one) / np.trace(whole) for name, one in left.items()}
     assert theta.shares == pytest.approx(expected, rel=1e-4) and set(of) < set(expected)
@@ -174,7 +173,7 @@ def test_a_report_has_the_share_of_the_variance_that_they_add(tmp_path):
     assert theta.table["unknown"].tolist()[1:] == ["field_error_0", "field_error_1"]
     assert theta.corner["unknown"].tolist() == ["zenith_angle_deg"]
     text = (run.folder / "summary.json").read_text(encoding="utf-8")
-    summary = MapSummary.model_validate_json(text).channels[0].theta
+    summary = summaries.MapSummary.model_validate_json(text).channels[0].theta
     assert summary["shares"] == pytest.approx(theta.shares, rel=1e-12)
     page = (run.folder / "report.html").read_text(encoding="utf-8")
     assert "<td>field_error_1</td><td>48</td>" in page and "Posterior of pairs of unknowns" in page

@@ -234,15 +234,11 @@ def test_about_given_values_it_is_the_closed_form(experiment, response_file):
     assert_same(found, white_posterior(np.concatenate(rows, axis=1), prior, noise, rest), 1e-3)
 
 
-def share() -> np.ndarray:
-    """How often each port is in the product of every datum: (data, ports)."""
-    ports = [[(p.i == port) + (p.j == port) for port in range(4)] for p in products.all_products()]
-    return np.repeat(np.array(ports, dtype=np.float64), 23, axis=0)
-
-
 def log_slopes(z: np.ndarray) -> np.ndarray:
     """dln F/dz: of gains that differ for each port ln F is half of the sum of two logarithms."""
-    return 0.005 * share() / (1.0 + 0.01 * z)
+    # how often each port is in the product of every datum: (data, ports)
+    ports = [[(p.i == port) + (p.j == port) for port in range(4)] for p in products.all_products()]
+    return 0.005 * np.repeat(np.array(ports, dtype=np.float64), 23, axis=0) / (1.0 + 0.01 * z)
 
 
 def test_rounds_find_the_mode_and_the_first_order_does_not(experiment, response_file):

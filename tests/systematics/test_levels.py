@@ -19,10 +19,9 @@ from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.covariance import Covariance, DenseCovariance, LowRankCovariance
 from lusee_bayes.noise.instrument_errors import difference
 from lusee_bayes.sampling.programs import numpyro_promotion
-from lusee_bayes.systematics import systematic
+from lusee_bayes.systematics import prior_spectrum, systematic
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.noise_level import NoiseLevel, RadiometerSection
-from lusee_bayes.systematics.prior_spectrum import PriorSpectrum, SpectrumSection
 from lusee_bayes.systematics.sources import PointSources
 
 LMAX, N_DATA = 4, 40
@@ -75,8 +74,8 @@ def steep(tilt):
 
 # neither the spectrum nor the level depends on the setup
 def spectrum(*edges, **options):
-    section = SpectrumSection(band_edges=edges, log_band_std=0.8, **options)
-    return PriorSpectrum.build(section, object.__new__(Setup), Around())
+    section = prior_spectrum.SpectrumSection(band_edges=edges, log_band_std=0.8, **options)
+    return prior_spectrum.PriorSpectrum.build(section, object.__new__(Setup), Around())
 
 
 LEVEL = NoiseLevel.build(RadiometerSection(log_factor_std=0.7), object.__new__(Setup), Around())
@@ -193,14 +192,6 @@ class Correlated(systematic.AdditiveNoise):
         return DenseCovariance(jnp.kron(jnp.eye(self.layout.n_products), kernel), "the hum")
 
 
-@pytest.fixture(scope="module")
-def model():
-    n = N_PRODUCTS * N_TIMES
-    a, noise = np.random.default_rng(0).normal(size=(n, N_MODES)), jnp.full(n, 0.1)
-    prior, noise = lb.HarmonicPrior(jnp.ones(3)), lb.DiagonalCovariance(noise)
-    return lb.LinearGaussian(jnp.asarray(a), prior, noise, jnp.arange(float(n)))
-
-
 def terms():
     layout = DataLayout(N_PRODUCTS, N_TIMES)
     patterns = np.random.default_rng(1).normal(size=(layout.size, 2))
@@ -209,8 +200,12 @@ def terms():
 
 
 @pytest.mark.parametrize("term", terms(), ids=lambda term: term.name)
-def test_marginalised_and_sampled_are_one_distribution(model, term):
+def test_marginalised_and_sampled_are_one_distribution(term):
     """What is added to the offset is linear in the site's normals, with the covariance in N."""
+    n = N_PRODUCTS * N_TIMES
+    a, noise = np.random.default_rng(0).normal(size=(n, N_MODES)), jnp.full(n, 0.1)
+    prior, noise = lb.HarmonicPrior(jnp.ones(3)), lb.DiagonalCovariance(noise)
+    model = lb.LinearGaussian(jnp.asarray(a), prior, noise, jnp.arange(float(n)))
     dense = np.asarray(term.covariance().dense())
     within(np.asarray(term.marginalised(model).noise.dense() - model.noise.dense()), dense, 1e-13)
     rank = term.covariance().rank

@@ -8,7 +8,6 @@ import pytest
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import true_values
-from lusee_bayes.noise.instrument_errors import GainDrift
 from lusee_bayes.systematics import gain_drifts, systematic
 from lusee_bayes.testing import load_scenario, small_scenario
 
@@ -79,7 +78,7 @@ def test_sampled_drifts_multiply_what_is_marginalised_once(other):
     scenario = load_scenario("fiducial", ["lmax=3", TWO, drifts, other])
     experiment = lb.build(scenario)
     pieces, values = program_pieces(experiment), dict(true_values(experiment.setup))
-    drawn = GainDrift(values["gain_sigma"], values["gain_correlation_h"])
+    drawn = lb.GainDrift(values["gain_sigma"], values["gain_correlation_h"])
     key, hours = (
         gain_drifts.GainDrifts.own_key(jax.random.key(scenario.seed)),
         experiment.setup.observation.hours,

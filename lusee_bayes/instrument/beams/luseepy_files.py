@@ -46,17 +46,8 @@ from lusee_bayes.core import arrays, formats, harmonics
 from lusee_bayes.core.checks import Described, counted, extent
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.layouts import UNSTATED, Attribute, Layout, Variable
-from lusee_bayes.instrument.beams.fields import (
-    Angles,
-    AntennaFields,
-    HemisphereGrid,
-    Interpolation,
-    ProductBeams,
-    at_frequency,
-    neighbours,
-    on_grid,
-    product_modes,
-)
+from lusee_bayes.instrument.beams import fields as beam_fields
+from lusee_bayes.instrument.beams.fields import AntennaFields, HemisphereGrid, ProductBeams, on_grid
 from lusee_bayes.instrument.beams.source import BeamSource, Circuit, JFETReceiver, Receiver
 from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices, to_real
 
@@ -123,7 +114,7 @@ class BandLimitedGrid(HemisphereGrid):
     """
 
     @classmethod
-    def of(cls, theta: Angles, n_phi: int) -> BandLimitedGrid:
+    def of(cls, theta: beam_fields.Angles, n_phi: int) -> BandLimitedGrid:
         """Return the rule for ``theta`` in equal steps from 0 to pi / 2, both included."""
         # lambda_00 = 1 / sqrt(4 pi)
         even = cls(theta, np.ones_like(theta), n_phi).polar_weights(0)[:, 0]
@@ -145,7 +136,7 @@ class BandLimitedGrid(HemisphereGrid):
         return summed
 
 
-def cardinal_functions(theta: Angles, intervals: int, parity: int) -> np.ndarray:
+def cardinal_functions(theta: beam_fields.Angles, intervals: int, parity: int) -> np.ndarray:
     """Return trigonometric polynomials that are 1 at one sample and 0 at the others.
 
     The samples are pi k / intervals, k = 0 .. intervals.
@@ -224,10 +215,10 @@ class LuseepyBeam(Described, BeamSource):
 
     path: str
     frequencies_mhz: Float[np.ndarray, " frequencies"]
-    theta: Angles
+    theta: beam_fields.Angles
     e_theta: Complex[np.ndarray, "frequencies *ports theta phi"]
     e_phi: Complex[np.ndarray, "frequencies *ports theta phi"]
-    interpolation: Interpolation = field(default="linear", kw_only=True)
+    interpolation: beam_fields.Interpolation = field(default="linear", kw_only=True)
     turntable_offset_deg: float = field(default=0.0, kw_only=True)
     luseepy_quadrature: bool = field(default=False, kw_only=True)
     moon_k: float = field(default=0.0, kw_only=True)
@@ -279,18 +270,20 @@ class LuseepyBeam(Described, BeamSource):
                 (w, self._received([self.e_theta[k], self.e_phi[k]], known[k], frequency_mhz, grid))
                 for k, w in self._neighbours(frequency_mhz)
             ]
-        modes = sum(w * product_modes(fields, lmax, normalise=False) for w, fields in weighted)
+        modes = sum(
+            w * beam_fields.product_modes(fields, lmax, normalise=False) for w, fields in weighted
+        )
         return ProductBeams(modes, float(frequency_mhz))
 
-    def interpolated(self, frequency_mhz: float) -> Interpolation | None:
+    def interpolated(self, frequency_mhz: float) -> beam_fields.Interpolation | None:
         return self.interpolation if len(self._neighbours(frequency_mhz)) > 1 else None
 
     def _neighbours(self, frequency_mhz: float) -> list[tuple[int, float]]:
-        return neighbours(self.path, self.frequencies_mhz, frequency_mhz)
+        return beam_fields.neighbours(self.path, self.frequencies_mhz, frequency_mhz)
 
     def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
         mhz, rule = self.frequencies_mhz, self.interpolation
-        return at_frequency(self.path, mhz, frequency_mhz, *parts, rule=rule)
+        return beam_fields.at_frequency(self.path, mhz, frequency_mhz, *parts, rule=rule)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -29,15 +29,8 @@ from scipy.constants import speed_of_light
 from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace
 from lusee_bayes.core.checks import is_traced, require_array, require_finite, require_positive
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.beams.fields import (
-    AntennaFields,
-    Fields,
-    HemisphereGrid,
-    ProductBeams,
-    mean_auto_integral,
-    product_modes,
-    stokes_pairs,
-)
+from lusee_bayes.instrument.beams import fields as beam_fields
+from lusee_bayes.instrument.beams.fields import AntennaFields, Fields, HemisphereGrid, ProductBeams
 from lusee_bayes.instrument.beams.source import BeamSource, Parameter
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import to_real
@@ -310,7 +303,7 @@ def _modes(
     frequency_mhz: Scalar, lmax: int, monopoles: Monopoles, stokes: str, nodes: Any
 ) -> Float[Array, "products modes"]:
     grid = HemisphereGrid.gauss_legendre(*nodes) if nodes else HemisphereGrid.for_lmax(lmax)
-    return product_modes(monopoles.fields(frequency_mhz, grid), lmax, stokes=stokes)
+    return beam_fields.product_modes(monopoles.fields(frequency_mhz, grid), lmax, stokes=stokes)
 
 
 # access to each parameter of the antennas, and the ends of its domain
@@ -386,9 +379,11 @@ def _patterns(
     xp = namespace(frequency_mhz, directions, monopoles)
     east, north, up = xp.where(visible[:, None], directions, np.array([0.6, 0.0, 0.8])[None]).T
     theta, phi = xp.arctan2(xp.hypot(east, north), up), xp.arctan2(north, east)
-    patterns = to_real(stokes_pairs(*monopoles.towards(frequency_mhz, theta, phi), stokes))
+    fields = monopoles.towards(frequency_mhz, theta, phi)
+    patterns = to_real(beam_fields.stokes_pairs(*fields, stokes))
     # the autos' integral is converged on the coarsest grid
-    scale = mean_auto_integral(monopoles.fields(frequency_mhz, HemisphereGrid.for_lmax(0)))
+    whole = monopoles.fields(frequency_mhz, HemisphereGrid.for_lmax(0))
+    scale = beam_fields.mean_auto_integral(whole)
     return xp.where(visible[None], patterns / scale, 0.0)
 
 

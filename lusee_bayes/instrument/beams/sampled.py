@@ -31,22 +31,13 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Complex, Float, Inexact
 
-from lusee_bayes.core import formats
-from lusee_bayes.core.checks import Described, listed, require_positive
+from lusee_bayes.core import checks, files, formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.layouts import Attribute, Kind, Layout, Variable
 from lusee_bayes.core.lazy import healpy, pyuvdata
 from lusee_bayes.core.reading import naming, reading, require_file
-from lusee_bayes.instrument.beams.fields import (
-    AntennaFields,
-    HemisphereGrid,
-    Pairs,
-    ProductBeams,
-    at_frequency,
-    from_rings,
-    on_grid,
-)
+from lusee_bayes.instrument.beams import fields as beam_fields
+from lusee_bayes.instrument.beams.fields import AntennaFields, HemisphereGrid, ProductBeams, on_grid
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, to_matrix, to_real
@@ -150,7 +141,7 @@ class Directions:
     def scalars_on(self, values: Sampled, grid: HemisphereGrid, turn_deg: float) -> OnGrid:
         """Interpolate functions, turned from East towards North, to a grid."""
         if self.theta is None:
-            return from_rings(values, grid.theta, grid.phi - np.radians(turn_deg))
+            return beam_fields.from_rings(values, grid.theta, grid.phi - np.radians(turn_deg))
         turned = [on_grid(one.astype(np.complex128), self.theta, grid, turn_deg) for one in values]
         return np.stack(turned) if np.iscomplexobj(values) else np.stack(turned).real
 
@@ -167,7 +158,7 @@ class Directions:
         theta, phi = healpy.pix2ang(self.nside, np.arange(e_theta.shape[-1]))
         along = [a * e_theta + b * e_phi for a, b in zip(*_axes(theta, phi), strict=True)]
         own_phi = grid.phi - np.radians(turn_deg)
-        fixed = [from_rings(one, grid.theta, own_phi) for one in along]
+        fixed = [beam_fields.from_rings(one, grid.theta, own_phi) for one in along]
         back = _axes(grid.theta[:, None], own_phi[None])
         return tuple(sum(a * one for a, one in zip(axis, fixed, strict=True)) for axis in back)
 
@@ -180,7 +171,7 @@ def _axes(theta: np.ndarray, phi: np.ndarray) -> tuple[list[np.ndarray], list[np
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class SampledBeams(Described, BeamSource):
+class SampledBeams(checks.Described, BeamSource):
     """Fields of antennas, or beams of products, in directions of a grid or of HEALPix pixels.
 
     Create them from arrays with :func:`sampled_beams`.
@@ -220,7 +211,7 @@ class SampledBeams(Described, BeamSource):
     def description(self) -> tuple[str, ...]:
         kind = "E fields of" if self.products is None else "product beams of"
         scale = "K per K" if self.absolute else "normalised so that autos integrate to one"
-        frequencies = listed(tuple(f"{f:g}" for f in self.frequencies_mhz))
+        frequencies = checks.listed(tuple(f"{f:g}" for f in self.frequencies_mhz))
         at, where = self.directions, f"HEALPix pixels of NSIDE {self.directions.nside}"
         if at.theta is not None:
             where = f"{len(at.theta)} theta x {at.n_phi} phi"
@@ -243,14 +234,15 @@ class SampledBeams(Described, BeamSource):
         turned = self.directions.vectors_on(*parts, grid, self.turntable_offset_deg)
         return AntennaFields(*turned, grid)
 
-    def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> Pairs:
+    def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> beam_fields.Pairs:
         if self.products is None:
             return super().patterns(frequency_mhz, grid)
         (beams,) = self._at(frequency_mhz, self.products)
         return to_matrix(self.directions.scalars_on(beams, grid, self.turntable_offset_deg))
 
     def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
-        return at_frequency(self.path, self.frequencies_mhz, frequency_mhz, *parts, rule="spline")
+        mhz = self.frequencies_mhz
+        return beam_fields.at_frequency(self.path, mhz, frequency_mhz, *parts, rule="spline")
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         """Return the beams of all products in K per K.
@@ -325,7 +317,7 @@ def sampled_beams(
     arrays = {name: x[None] if alone else x for name, x in filled.items()}
     arrays |= {name: np.atleast_1d(np.asarray(x, dtype=float)) for name, x in grid.items()}
     arrays["frequency_mhz"] = np.atleast_1d(np.asarray(frequencies_mhz, dtype=float))
-    require_positive(f"{path}: frequency_mhz", arrays["frequency_mhz"])
+    checks.require_positive(f"{path}: frequency_mhz", arrays["frequency_mhz"])
     kind = "complex" if products is None else "real"
     given = layout(tuple(fields), bool(grid), kind).checked(path, arrays, {}).arrays
     some = given[next(iter(fields))]
@@ -372,7 +364,7 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
     InputError
         If the file is missing, damaged or of another kind, or not as declared.
     """
-    path = user_path(path)
+    path = files.user_path(path)
     if path.is_file() and formats.is_fits(path):
         read = partial(formats.read_fits, path, hint=HINT)
     else:
@@ -415,7 +407,7 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
     -------
     Path
     """
-    path, theta = user_path(path), beams.directions.theta
+    path, theta = files.user_path(path), beams.directions.theta
     arrays = {"frequency_mhz": beams.frequencies_mhz}
     said = {"format": formats.BEAMS, "absolute": int(beams.absolute)}
     if beams.products is None:
@@ -428,7 +420,7 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
     if theta is not None:
         arrays["theta_deg"], n = np.degrees(theta), beams.directions.n_phi
         arrays["phi_deg"] = 360.0 * np.arange(n) / n
-    with replacing(path) as partly:
+    with files.replacing(path) as partly:
         if path.suffix.lower() in (".fits", ".fit"):
             hdus = [fits.PrimaryHDU(header=fits.Header(list(said.items())))]
             hdus += [fits.ImageHDU(a.copy(), name=name) for name, a in arrays.items()]

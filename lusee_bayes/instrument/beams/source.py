@@ -23,10 +23,9 @@ from jaxtyping import Complex, Float
 from pydantic import BeforeValidator, Field
 from scipy.constants import Boltzmann
 
+from lusee_bayes.core import formats, layouts
 from lusee_bayes.core.arrays import Array, Values
 from lusee_bayes.core.errors import require_known
-from lusee_bayes.core.formats import read_fits
-from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.core.section import LARGEST, Positive, Section
 from lusee_bayes.instrument.beams import fields as beam_fields
@@ -38,11 +37,11 @@ Lines = Float[np.ndarray, "lines products modes"]
 N_FINE, N_PHI, MARGIN = 181, 720, 8
 # matrices of the ports at every frequency
 LOADS, BY_PORTS = ("ZL_real", "ZL_imag"), ("freq", N_ANTENNAS, N_ANTENNAS)
-LOADS_LAYOUT = Layout(
+LOADS_LAYOUT = layouts.Layout(
     "loads ZL of four receivers, as in luseepy's four-port waterfalls",
     {
-        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
-        **dict.fromkeys(LOADS, Variable(BY_PORTS, unit="Ohm")),
+        "freq": layouts.Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        **dict.fromkeys(LOADS, layouts.Variable(BY_PORTS, unit="Ohm")),
     },
 )
 
@@ -172,10 +171,8 @@ class MeasuredReceiver(Receiver):
     load_ohm: Complex[np.ndarray, "frequencies ports ports"]
 
     def load(self, frequency_mhz: float) -> Ohms:
-        (ohm,) = beam_fields.at_frequency(
-            self.path, self.frequencies_mhz, frequency_mhz, self.load_ohm
-        )
-        return ohm
+        mhz = self.frequencies_mhz
+        return beam_fields.at_frequency(self.path, mhz, frequency_mhz, self.load_ohm)[0]
 
 
 def receiver_of(
@@ -204,7 +201,7 @@ def read_receiver(path: str | Path) -> MeasuredReceiver:
     InputError
         For a missing or damaged file, or one without such images.
     """
-    images = read_fits(path, LOADS_LAYOUT, "check beam.receiver").arrays
+    images = formats.read_fits(path, LOADS_LAYOUT, "check beam.receiver").arrays
     return receiver_of(path, images, "freq", *LOADS)
 
 

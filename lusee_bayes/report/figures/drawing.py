@@ -142,8 +142,7 @@ def side_by_side(axes: Axes, data: Float[np.ndarray, "n times"], products: Seque
         axes.axvline(start, color=GREY, lw=0.4)
     axes.set_xticks(starts + 0.5 * n_times, products, fontsize=8)
     axes.tick_params(axis="x", length=0)
-    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
-    axes.set_xlim(0, data.size)
+    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]", xlim=(0, data.size))
 
 
 def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "theta phi"]):

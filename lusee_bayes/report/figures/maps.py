@@ -13,9 +13,8 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from lusee_bayes.core import harmonics, reading
 from lusee_bayes.core.arrays import Modes
-from lusee_bayes.core.harmonics import lmax_of, modes_to_map, taper_fwhm_deg
-from lusee_bayes.core.reading import read_table
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.measures import ell_cross
@@ -70,7 +69,7 @@ def draws(result: MapResult) -> Panels | None:
         return None
     norm, nside = scales(channel)["temperature"], max(NSIDE, channel.nside)
     panels = {
-        f"draw {k}": (modes_to_map(sky, nside), norm)
+        f"draw {k}": (harmonics.modes_to_map(sky, nside), norm)
         for k, sky in enumerate(channel.details.draws, 1)
     }
     return drawing.sky_figures(panels, channel.highest_altitude)
@@ -168,7 +167,7 @@ def channel_map(channel: ChannelResult) -> Figure:
     figure.suptitle(
         f"{channel.frequency_mhz:g} MHz, Galactic coordinates; dashed: region that never rises\n"
         f"{', '.join(list(panels)[:-1])}: smoothed with a beam of "
-        f"{taper_fwhm_deg(lmax_of(len(channel.mean))):.1f}° (FWHM)"
+        f"{harmonics.taper_fwhm_deg(harmonics.lmax_of(len(channel.mean))):.1f}° (FWHM)"
     )
     return figure
 
@@ -309,7 +308,7 @@ def spectrum_figure(spectrum: SkySpectrum, tables: Sequence[Path] = ()) -> Figur
         if (inside := (grid >= measured[0]) & (grid <= measured[1])).any():
             axes.plot(grid[inside], law(grid[inside]), color=GREY, ls=line, lw=1, label=name)
     for path, marker in zip(tables, cycle("sD^v")):
-        table = read_table(path, MEASURED)
+        table = reading.read_table(path, MEASURED)
         values = table["frequency_mhz"], table["temperature_k"], table.get("std_k")
         axes.errorbar(*values, color="black", fmt=marker, mfc="none", ms=5, lw=1, label=path.stem)
     axes.set(ylabel="brightness temperature [K]", yscale="log")

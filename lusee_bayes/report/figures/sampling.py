@@ -16,8 +16,7 @@ from matplotlib.figure import Figure
 from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.report.figures import drawing
 from lusee_bayes.results.sample_result import SampleResult
-from lusee_bayes.sampling.least import N_BINS
-from lusee_bayes.sampling.validation import Comparison, Ranks
+from lusee_bayes.sampling import least, validation
 
 # style of a value for every mode
 DOTS = {"ls": "", "marker": ".", "ms": 3, "color": drawing.BLUE}
@@ -132,7 +131,7 @@ def traces(run: SampleResult) -> Figure:
     return figure
 
 
-def comparison(result: Comparison) -> Figure:
+def comparison(result: validation.Comparison) -> Figure:
     """HMC compared with the analytic posterior: means, variances, covariance, effective sizes."""
     figure, ((means, variances), (covariance, sizes)) = drawing.framed((11, 7), 2, 2)
     limit = result.checks[0].upper
@@ -161,15 +160,15 @@ def comparison(result: Comparison) -> Figure:
     return figure
 
 
-def rank_statistics(ranks: Ranks) -> Figure:
+def rank_statistics(ranks: validation.Ranks) -> Figure:
     """Rank histograms, with a band that contains 99 % of the bins, and coverage by level."""
     shown = np.unique(np.linspace(0, len(ranks.names) - 1, 11).astype(int))
     figure, panels = drawing.framed((12, 7), 3, 4)
     low, high = ranks.band()
-    centres = (np.arange(N_BINS) + 0.5) / N_BINS
+    centres = (np.arange(least.N_BINS) + 0.5) / least.N_BINS
     histogram, p_values = ranks.histogram(), ranks.p_values()
     for axes, k in zip(panels.flat, shown, strict=False):
-        axes.bar(centres, histogram[k], 1.0 / N_BINS, color=drawing.BLUE, alpha=0.7)
+        axes.bar(centres, histogram[k], 1.0 / least.N_BINS, color=drawing.BLUE, alpha=0.7)
         axes.axhspan(low, high, color=drawing.GREY, alpha=0.25, lw=0)
         axes.set_title(f"{ranks.names[k]}, p = {p_values[k]:.2g}", fontsize=9)
         axes.set(xlim=(0, 1), xticks=[0, 0.5, 1])
