@@ -33,16 +33,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.constants import Boltzmann, speed_of_light
 
-from lusee_bayes.core.arrays import Vector
+from lusee_bayes.core.arrays import T, Vector
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import harmonics_at, per_mode, require_nside
 from lusee_bayes.core.lazy import coordinates, healpy
+from lusee_bayes.core.reading import read_yaml
 
 Numbers = float | np.ndarray
 
@@ -143,19 +145,6 @@ class Region:
         middle = -(u @ w) / uu
         half = np.sqrt(np.maximum(middle**2 - (w @ w - 1.0) / uu, 0.0))
         return np.maximum(middle - half, 0.0), np.maximum(middle + half, 0.0)
-
-
-# NE2001's local interstellar medium and one of its clumps, <n^2> = F n^2 with its n and F. Where
-# two overlap the first in the list counts, as in NE2001; its local hot bubble, a slanted cylinder,
-# and its Loop I, a half sphere, are upright ellipsoids here. The Vela shell lies at l = 263.25,
-# b = -9, 0.25 kpc away, and is opaque at 10 MHz: it causes much of ULSA's odd multipoles there.
-REGIONS = (
-    Region("IRAS Vela shell", (-0.2452, 8.5290, -0.0391), (0.038,) * 3, 0.0, 4.0**2 * 3.0),
-    Region("local hot bubble", (0.01, 8.45, 0.17), (0.085, 0.10, 0.33), 0.0, 0.005**2 * 0.01),
-    Region("Loop I", (-0.045, 8.40, 0.07), (0.18, 0.18, 0.18), 0.0, 0.0125**2 * 0.2),
-    Region("local superbubble", (-0.75, 9.0, -0.05), (1.05, 0.425, 0.325), 139.0, 0.016**2 * 0.01),
-    Region("low-density region", (1.36, 8.06, 0.0), (1.50, 0.75, 0.50), -24.2, 0.012**2 * 0.10),
-)
 
 
 # Galactic longitude and latitude in degrees
@@ -294,23 +283,6 @@ class ExtendedObject:
 
 # steps in the polar angle: exact to 1e-5 for widths of some degrees
 N_POLAR = 6000
-# Loops: Berkhuijsen, Haslam & Salter 1971 (A&A 14, 252). Other centres and sizes: SIMBAD. Strengths
-# are those of surveys at 22 to 408 MHz to within a factor of two, rounded up; where ionised gas
-# absorbs, an object is darker than its surroundings.
-EXTENDED_OBJECTS = (
-    ExtendedObject("LMC", 280.5, -32.9, 0.0, 6.0, 0.5),
-    ExtendedObject("SMC", 302.8, -44.3, 0.0, 3.0, 0.2),
-    ExtendedObject("Cygnus X", 80.0, 1.0, 0.0, 7.0, 1.0),
-    ExtendedObject("Cepheus", 110.0, 3.0, 0.0, 7.0, 0.5),
-    ExtendedObject("W3, W4 and W5", 135.0, 1.0, 0.0, 5.0, 0.5),
-    ExtendedObject("Vela", 263.6, -2.8, 0.0, 7.0, 0.5),
-    ExtendedObject("Gum nebula", 258.0, -2.0, 0.0, 30.0, 0.2),
-    ExtendedObject("Orion-Eridanus", 200.0, -25.0, 0.0, 35.0, 0.1),
-    ExtendedObject("Loop I", 329.0, 17.5, 58.0, 10.0, 0.2),
-    ExtendedObject("Loop II", 100.0, -32.5, 45.5, 8.0, 0.1),
-    ExtendedObject("Loop III", 124.0, 15.5, 32.5, 8.0, 0.1),
-    ExtendedObject("Loop IV", 315.0, 48.5, 20.0, 6.0, 0.1),
-)
 
 
 def kelvin_steradian(flux_jy: Numbers, frequency_mhz: Numbers) -> Numbers:
@@ -338,25 +310,16 @@ def galactic_unit_vector(ra_deg: float, dec_deg: float) -> Float[np.ndarray, "3"
     return np.asarray(position.cartesian.xyz.value, dtype=np.float64)
 
 
-# Positions: NED and SIMBAD. Polynomials and their lower ends: Perley & Butler 2017 (ApJS 230, 7),
-# table 6, epoch 2016 for the two supernova remnants. Cen A: 2740 Jy at 408 MHz with its giant lobes
-# (Cooper, Price & Cole 1965, Aust. J. Phys. 18, 589) and a single index, -0.70, from 10 to 4750 MHz
-# (Alvarez et al. 2000, A&A 355, 863).
-# Turnovers: Cyg A from 13.5 kJy at 10.05 MHz and Cas A from 28 kJy there in 1965 (Bridle 1967, in
-# Baars et al. 1977, A&A 61, 99), 18.5 kJy in 2016 if fading by 0.8 % a year (Helmboldt & Kassim
-# 2009, AJ 138, 838); the others from this module's column of electrons, which is an upper limit for
-# Tau A, 2 kpc away.
-BRIGHT_SOURCES = (
-    PointSource("Cas A", 350.8500, 58.8150, (3.3584, -0.7518, -0.035, -0.071), 200.0, 11.9),
-    PointSource("Cyg A", 299.8682, 40.7339, (3.3498, -1.0022, -0.225, 0.023, 0.043), 50.0, 12.7),
-    PointSource("Vir A", 187.7059, 12.3911, (2.4466, -0.8116, -0.048), 50.0, 1.2),
-    PointSource("Tau A", 83.6331, 22.0145, (2.9516, -0.2170, -0.047, -0.067), 50.0, 2.7),
-    PointSource("Cen A", 201.3651, -43.0191, (3.4378 + 0.70 * math.log10(0.408), -0.70), 10.0, 2.3),
-    PointSource("For A", 50.6738, -37.2082, (2.2180, -0.661), 200.0, 1.2),
-    PointSource("Her A", 252.7839, 4.9926, (1.8298, -1.0247, -0.0951), 200.0, 1.9),
-    PointSource("Hyd A", 139.5235, -12.0955, (1.7795, -0.9176, -0.084, -0.0139, 0.030), 50.0, 1.6),
-    PointSource("Pic A", 79.9572, -45.7788, (1.9380, -0.7470, -0.074), 200.0, 1.3),
-)
+def _of_table(kind: type[T], rows: dict[str, list]) -> tuple[T, ...]:
+    """Objects from their names and the values of their other fields."""
+    values = {n: (tuple(x) if isinstance(x, list) else x for x in row) for n, row in rows.items()}
+    return tuple(kind(name, *row) for name, row in values.items())
+
+
+OBJECTS = read_yaml(Path(__file__).with_name("galaxy.yaml"), "the objects of the embedded sky")
+REGIONS = _of_table(Region, OBJECTS["regions"])
+EXTENDED_OBJECTS = _of_table(ExtendedObject, OBJECTS["extended"])
+BRIGHT_SOURCES = _of_table(PointSource, OBJECTS["sources"])
 
 
 # Synchrotron emissivity (Cong et al. 2021, constant spectral index).
