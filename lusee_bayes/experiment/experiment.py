@@ -27,7 +27,7 @@ from lusee_bayes.experiment.diagnosis import is_mistaken
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.second_order import with_second_order
+from lusee_bayes.experiment.second_order import with_other_modes, with_second_order
 from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
@@ -248,7 +248,7 @@ def infer(experiment: Experiment, report: rounds.Report | None = None) -> rounds
     """
     start = Around(experiment.data)
     found = experiment.inference or rounds.settled(experiment.setup, start, report=report)
-    return with_second_order(experiment.setup, found)
+    return with_second_order(experiment.setup, with_other_modes(experiment.setup, found))
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:

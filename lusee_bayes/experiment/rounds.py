@@ -92,7 +92,7 @@ class Inference:
     around : Around
         Expansion point of N.
     unsettled : str
-        A sentence if the map still moves from round to round; empty otherwise.
+        A sentence if the map still moves from round to round, or there is another one; or empty.
     learned : Learned or None
         How the prior was learned in these rounds.
     """
@@ -341,7 +341,7 @@ def _approached(setup: Setup, around: Around, report: Report) -> tuple[Inference
         if around.tempered > 1.0:
             factors.append(around.tempered)
             stalled = stalled or factors[-1] > STALLED * min(factors[:-PATIENCE], default=np.inf)
-            exact = _exact(setup, around)
+            exact = solved_at(setup, around)
             around = exact.around
             if at_rest:
                 around, exact = replace(around, tempered=1.0), None
@@ -365,7 +365,7 @@ def _elsewhere(setup: Setup, inference: Inference, way: int) -> Around:
             z = part.systematic.inside(z)
             values |= part.systematic.in_units(z)
             log_prior -= 0.5 * float(z @ z)
-        exact = _exact(setup, Around(inference.around.data, values=values))
+        exact = solved_at(setup, Around(inference.around.data, values=values))
         likely = float(exact.posterior.log_evidence) + log_prior
         if best is None or likely > best[0]:
             best = likely, replace(exact.around, tempered=_tempered(exact.misfit(), 0))
@@ -452,7 +452,7 @@ def _around(
     if around.tempered > 1.0 or not inference.moving:
         return around, step, None
     # with the unknowns at these values: the sky that they would hide scatters without bound
-    exact = _exact(setup, around)
+    exact = solved_at(setup, around)
     n_unknowns = sum(len(part.centre) for part in inference.expanded)
     return replace(around, volume=_volume(exact.solution, n_unknowns)), step, exact
 
@@ -465,11 +465,11 @@ def _beginning(setup: Setup, around: Around) -> Around:
     """
     if not first_order(setup.scenario):
         return around
-    exact, rounds = _exact(setup, around), MAX_TEMPERED_ROUNDS * around.still
+    exact, rounds = solved_at(setup, around), MAX_TEMPERED_ROUNDS * around.still
     return replace(exact.around, tempered=_tempered(exact.misfit(), rounds))
 
 
-def _exact(setup: Setup, around: Around) -> Inference:
+def solved_at(setup: Setup, around: Around) -> Inference:
     """Infer the sky with the instrument fixed at these values, and expand around that sky."""
     moved_setup = moved(setup, around.values)
     model, held = model_about(moved_setup, replace(around, values=None), moving=False)

@@ -30,12 +30,16 @@ from jaxtyping import Float
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.model import base_model, systematics
-from lusee_bayes.experiment.rounds import Inference, less_moved
+from lusee_bayes.experiment.rounds import Inference, less_moved, settled, solved_at
+from lusee_bayes.instrument.pointing import CLOCK
 from lusee_bayes.linear.amplitudes import AmplitudesOfSky
 from lusee_bayes.noise.covariance import LowRankFactor, LowRankUpdate
-from lusee_bayes.systematics.context import Setup
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import LowRankNoise, Marginalised, with_added
 
+# steps along the widest direction of clock and pointing, in prior standard deviations, and a mode:
+# so far is its map (rms, in standard deviations), and ln p at most so much lower
+STEPS, APART, RIVAL = (-2.0, -1.0, 1.0, 2.0), 3.0, 5.0
 # number of draws to weight, in total and first, of those that show whether the map would move, and
 # the largest k for a valid Gaussian
 N_WEIGHED, N_FIRST, N_FEW, LARGEST_K = 100, 25, 8, 0.7
@@ -115,6 +119,28 @@ class Draws(NamedTuple):
         solved = np.asarray(inference.solution.factor.solve(self.beyond.T))
         pulls = np.asarray(inference.model.coupling.transpose_mv(solved))
         return float(np.sqrt(np.mean((np.asarray(inference.posterior.root()).T @ pulls) ** 2)))
+
+
+def with_other_modes(setup: Setup, inference: Inference) -> Inference:
+    """Look for other orientations of the antennas: two turns that the sky can follow often fit."""
+    part, around = inference.offsets, inference.around
+    turns = () if part is None else [n for n in part.systematic.names if n not in CLOCK]
+    if len(turns) < 2 or inference.unsettled or not inference.fits:
+        return inference
+    amplitudes, best = inference.amplitudes(part), inference
+    middle, way = part.expected + amplitudes.mean, np.linalg.eigh(amplitudes.covariance)[1][:, -1]
+    for step in STEPS:
+        values = {**around.values, **part.systematic.in_units(middle + step * way)}
+        found = settled(setup, solved_at(setup, Around(around.data, values=values)).around)
+        gained = float(found.posterior.log_evidence - best.posterior.log_evidence)
+        if found.posterior.rms_shift_from(best.posterior.mean) > APART and gained > -RIVAL:
+            named = ", ".join(f"{name} = {found.around.values[name]:.3g}" for name in turns)
+            said = f"The data fit as well with {named}, and another map (ln p {gained:+.1f}): "
+            said += "error bars are those of one of the two."
+            if gained > RIVAL:
+                best, said = replace(found, learned=inference.learned), ""
+            best = replace(best, unsettled=said)
+    return best
 
 
 def with_second_order(setup: Setup, inference: Inference) -> Inference:

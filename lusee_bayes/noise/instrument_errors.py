@@ -1,7 +1,5 @@
 """Errors of gains and beams as terms of N.
 
-Also noise along templates of the user, T P T^T.
-
 **Gain drifts** are Gaussian processes g_i(t), one per antenna, that multiply the visibilities, ::
 
     V_ij -> (1 + g_i)(1 + g_j) V_ij,    <g_i(t) g_j(t')> = delta_ij C_g(t, t'),
@@ -36,7 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core import checks, linalg
+from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, Grid, scalar
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import ProductBeams
@@ -48,41 +46,6 @@ from lusee_bayes.sky.prior import Prior
 
 Gains = Float[Array, "antennas times"]
 Hours = Float[Array, " times"]
-
-
-def template_noise(
-    templates: Float[Array, "data templates"],
-    prior: Float[Array, " templates"] | Float[Array, "templates templates"],
-    layout: DataLayout,
-) -> LowRankCovariance:
-    """Return the covariance T P T^T of known patterns with amplitudes a ~ N(0, P).
-
-    Parameters
-    ----------
-    templates : (data, templates) array
-        T: one column for each pattern, in K per unit of its amplitude.
-    prior : (templates,) or (templates, templates) array
-        The variances of the amplitudes, or their covariance P.
-    layout : DataLayout
-
-    Returns
-    -------
-    LowRankCovariance
-        In K^2.
-
-    Raises
-    ------
-    InputError
-        For templates of the wrong length, and for a P that is not positive definite.
-    """
-    checks.require_array("the templates", templates, (layout.size, None))
-    if prior.ndim == 1:
-        checks.require_positive("the templates' prior variance", prior)
-        prior = jnp.diag(prior)
-    checks.require_array("the templates' prior", prior, (templates.shape[1],) * 2)
-    checks.require_symmetric("the templates' prior", prior)
-    root = jnp.tril(linalg.checked_cholesky("the templates' prior", prior))
-    return LowRankCovariance(templates @ root, "the templates")
 
 
 # C_g is dropped below double precision relative to sigma_g^2: exp(-x^2 / 2) = eps

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from textwrap import wrap
 
@@ -31,10 +31,13 @@ from lusee_bayes.judge.cube_fit import ChannelFits, SharedTest
 from lusee_bayes.linear.joint import Blocks
 from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.sky_spectrum import IndexMaps, SkySpectrum
+from lusee_bayes.results.sky_spectrum import OBSERVED, IndexMaps, SkySpectrum
 from lusee_bayes.results.summaries import JointSummary, MapSummary, PullSummary
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.sky.spectral_prior import SpectralPrior
+
+# smallest part of the sky in which channels have observed other parts of it
+OTHER = 0.01
 
 
 def prior_sentence(experiment: Experiment) -> str:
@@ -55,8 +58,16 @@ def joint_prior_sentence(scenario: Scenario) -> str:
 
 
 def spectrum_of(channels: Sequence[ChannelResult]) -> SkySpectrum:
-    """Temperatures of regions of the sky in all channels."""
-    return SkySpectrum.of([(c.frequency_mhz, c.temperatures, c.departure) for c in channels])
+    """Temperatures of regions of the sky in all channels.
+
+    The observed sky gets another name if channels have not observed the same.
+    """
+    made = SkySpectrum.of([(c.frequency_mhz, c.temperatures, c.departure) for c in channels])
+    seen = np.stack([channel.highest_altitude >= 0.0 for channel in channels])
+    if (seen.any(0) & ~seen.all(0)).mean() < OTHER:
+        return made
+    names = [f"{name} of each channel" if name == OBSERVED else name for name in made.regions]
+    return replace(made, regions=tuple(names))
 
 
 def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:

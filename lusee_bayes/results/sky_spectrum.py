@@ -324,7 +324,7 @@ class SkySpectrum:
 
     def rows(self, region: str) -> tuple[list[str], list[list[str]]]:
         """Header and rows of a region's spectrum, in K, or a point source's, in Jy."""
-        k, kelvin = self.place(region), region in REGIONS
+        k, kelvin = self.place(region), region.startswith(REGIONS)
         name, unit, scale = ("T", "K", 1.0) if kelvin else ("S", "Jy", self.jansky)
         columns = {name: self.temperature[k], "+-": self.std[k]}
         if self.truth is not None:

@@ -512,8 +512,10 @@ def from_fitting(
 ) -> dict[str, float]:
     """Values, by name, of the unknowns common to all channels, given those that fit."""
     fitting = [(f, one) for f, one in zip(frequencies_mhz, shared, strict=True) if one.fits]
-    tied, _ = tie_channels(scenario, *zip(*fitting, strict=True))
-    z, (_, first) = dict(zip(tied.names, tied.mean[0].tolist(), strict=True)), fitting[0]
+    tied, tests = tie_channels(scenario, *zip(*fitting, strict=True))
+    agrees = [not test.disagrees for test in tests]
+    k = agrees.index(True) if any(agrees) else 0
+    z, (_, first) = dict(zip(tied.names, tied.mean[k].tolist(), strict=True)), fitting[k]
     common = {name: first.priors[name] for name, over in first.octaves.items() if np.isinf(over)}
     return {name: prior + std * z[name] for name, (prior, std) in common.items()}
 
@@ -635,7 +637,7 @@ def map_channels(
 
                 def make() -> ChannelInformation | ChannelAlone:
                     made, before = condition(channel, Stages(), values), first.read(channel, kind)
-                    if made.figures()["log_evidence"] < before.share.log_evidence:
+                    if Share.of(made).log_evidence < before.share.log_evidence:
                         return before
                     return kind.of(made, made.channel_data(**examine))
 

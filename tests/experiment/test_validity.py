@@ -142,6 +142,7 @@ OFFSETS = (
 )
 
 
+@pytest.mark.essential
 @pytest.mark.parametrize("seed", [1, 2])
 def test_turns_that_the_sky_can_follow_are_in_n_to_second_order(seed):
     """The distance is that of 81 modes, 1 +- 0.08, and third order; to first order, 220 and 59."""
@@ -152,6 +153,17 @@ def test_turns_that_the_sky_can_follow_are_in_n_to_second_order(seed):
     assert 0.75 < rms_of_directions(found, truth) < 1.3 < 0.1 * first
     doubts, notes = validity.reach(experiment, found)
     assert not doubts and "the second order of noise.pointing" in notes[0]
+
+
+@pytest.mark.essential
+def test_two_orientations_that_fit_are_named():
+    """The true one is the other: 3.0 degrees and a lean of -0.7; the map is far from the sky."""
+    offsets = "noise.pointing={turntable_deg: 1, tilt_east_deg: 1}"
+    given = "frequency_mhz=20", "prior={model: isotropic, spectrum: sky}", "seed=6"
+    experiment = lb.build(scenario_of(offsets, *given, lmax=5, step_s=21600.0))
+    found, truth = lb.infer(experiment), experiment.setup.sky.modes
+    assert found.fits and rms_of_directions(found, truth) > 100.0
+    assert "fit as well with turntable_deg = 3, tilt_east_deg = -0.7" in found.unsettled
 
 
 def test_nothing_is_weighed_where_nothing_was_found_in_rounds(plain):

@@ -14,7 +14,6 @@ from reference_linear import random_covariance
 import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise import covariance, time_blocks
-from lusee_bayes.noise.instrument_errors import template_noise
 from lusee_bayes.testing import check_covariance, close
 
 N_PRODUCTS, N_TIMES = 3, 4
@@ -366,40 +365,3 @@ def test_a_dense_term_can_be_built_inside_jit_from_known_numbers():
     matrix = jnp.asarray(random_covariance(np.random.default_rng(0), 3))
     got = jax.jit(lambda x: covariance.DenseCovariance(matrix).solve(x))(jnp.ones(3))
     close(got, np.linalg.solve(np.asarray(matrix), np.ones(3)))
-
-
-# --- templates ------------------------------------------------------------------------------------
-
-
-GAPS = np.zeros((4, 5), dtype=bool)
-GAPS[:, 2] = GAPS[1, 0] = True
-SEEN = DataLayout.from_flags(GAPS)
-RNG = np.random.default_rng(4)
-T = RNG.normal(size=(15, 3))
-P = random_covariance(RNG, 3)
-VARIANCES = np.array([0.5, 2.0, 1e4])
-
-
-@pytest.mark.parametrize(("prior", "matrix"), [(VARIANCES, np.diag(VARIANCES)), (P, P)])
-def test_the_term_is_t_p_t(prior, matrix):
-    expected = T @ matrix @ T.T
-    got = template_noise(jnp.asarray(T), jnp.asarray(prior), SEEN)
-    # products of a few numbers of order one
-    close(got.dense(), expected, 1e-14)
-    close(got.diagonal(), np.diag(expected), 1e-14)
-    assert got.root.shape == (15, 3)
-
-
-BAD_TEMPLATES = [
-    (T[:14], VARIANCES, r"the templates has shape \(14, 3\), expected \(15, any\)"),
-    (np.where(np.arange(15)[:, None] == 4, np.nan, T), VARIANCES, r"the templates.*NaN"),
-    (T, np.array([1.0, 0.0, 2.0]), r"prior variance must be positive, .* first at \(1,\)"),
-    (T, np.diag([1.0, -0.5, 2.0]), "prior is not positive definite: .* eigenvalue is -0.5 "),
-    (T, P + np.eye(3, k=1), "the templates' prior is not symmetric: .* up to 1 "),
-    (T, np.full((3, 3), np.inf), "the templates' prior.*NaN or infinity"),
-]
-
-
-@pytest.mark.parametrize(("templates", "prior", "message"), BAD_TEMPLATES)
-def test_bad_input_is_refused(templates, prior, message):
-    refuse(message, template_noise, jnp.asarray(templates), jnp.asarray(prior), SEEN)

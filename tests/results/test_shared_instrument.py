@@ -19,7 +19,7 @@ from lusee_bayes.linear.amplitudes import tie
 from lusee_bayes.report.figures.judgement import corner
 from lusee_bayes.results.sky_spectrum import UNOBSERVED, sky_regions
 from lusee_bayes.runs import channels
-from lusee_bayes.runs.channels import Share, kernel, map_channels, tie_channels
+from lusee_bayes.runs.channels import Share, from_fitting, kernel, map_channels, tie_channels
 from lusee_bayes.sky.galaxy import kelvin_steradian
 
 FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
@@ -126,6 +126,16 @@ def test_a_channel_without_an_unknown_tells_nothing_of_it():
     within(apart.covariance[2], np.diag([0.01, 1.0]), 1e-12)
     within(kernel(FREQUENCIES, np.inf), ALL, 0)
     within(kernel(FREQUENCIES, OCTAVES), SMOOTH, 1e-15)
+
+
+def test_others_start_from_the_channels_that_agree():
+    """Three of four say 75 + 0.5 std, whichever comes first."""
+    scenario, prior = lb.load_scenario("fiducial", SMALL), {"a": (75.0, 0.5)}
+    std = np.full((1, 1), 1e-2)
+    for said in ([-3.0, 0.5, 0.5, 0.5], [0.5, 0.5, -3.0, 0.5]):
+        shares = [Share({"a": np.inf}, np.array([z]), std**2, 4, prior, True, 0.0) for z in said]
+        found = from_fitting(scenario, [10.0, 20.0, 30.0, 40.0], shares)
+        assert found == pytest.approx({"a": 75.25}, abs=1e-3)
 
 
 @pytest.fixture(scope="module")

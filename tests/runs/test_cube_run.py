@@ -59,7 +59,8 @@ def test_channels_of_different_days(tmp_path):
     apart = three(frequencies="[20, 25]")
     starts = [(one, f"observation.start={days[one.frequency_mhz]}") for one in apart.channels()]
     data = [lb.build(lb.load_scenario(one, [start])).data for one, start in starts]
-    lb.run_map(apart, tmp_path / "map", data=data)
+    made = lb.run_map(apart, tmp_path / "map", data=data).result
+    assert "observed sky of each channel" in made.sky_spectrum().regions
     said = json.loads((tmp_path / "map" / "provenance.json").read_text())
     assert (
         said["first"][:10] == days[20.0] and said["last"] == data[1].observation.times[-1].isot[:19]
