@@ -31,7 +31,7 @@ from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.model import base_model, systematics
 from lusee_bayes.experiment.rounds import Inference, less_moved, settled, solved_at
-from lusee_bayes.instrument.pointing import CLOCK
+from lusee_bayes.instrument.pointing import CLOCK, offset_kind
 from lusee_bayes.linear.amplitudes import AmplitudesOfSky
 from lusee_bayes.noise.covariance import LowRankFactor, LowRankUpdate
 from lusee_bayes.systematics.context import Around, Setup
@@ -125,7 +125,7 @@ def with_other_modes(setup: Setup, inference: Inference) -> Inference:
     """Look for other orientations of the antennas: two turns that the sky can follow often fit."""
     part, around = inference.offsets, inference.around
     turns = () if part is None else [n for n in part.systematic.names if n not in CLOCK]
-    if len(turns) < 2 or inference.unsettled or not inference.fits:
+    if len(set(map(offset_kind, turns))) < 2 or inference.unsettled or not inference.fits:
         return inference
     amplitudes, best = inference.amplitudes(part), inference
     middle, way = part.expected + amplitudes.mean, np.linalg.eigh(amplitudes.covariance)[1][:, -1]

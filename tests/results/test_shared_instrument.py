@@ -193,6 +193,7 @@ def expected(dense) -> Answer:
     return dense[0]
 
 
+@pytest.mark.essential
 def test_skies_are_those_of_one_normal_equation(cube, expected):
     for k, channel in enumerate(cube.channels):
         own = slice(k * N_MODES, (k + 1) * N_MODES)
@@ -202,6 +203,7 @@ def test_skies_are_those_of_one_normal_equation(cube, expected):
     assert any("Unknowns of the beams are the same at all" in line for line in cube.lines())
 
 
+@pytest.mark.essential
 def test_tables_have_the_shared_values(cube, expected):
     shared, std = slice(3 * N_MODES, None), expected.std
     for k, channel in enumerate(cube.channels):
@@ -216,6 +218,7 @@ def test_tables_have_the_shared_values(cube, expected):
         np.testing.assert_allclose(np.concatenate(list(width)), std[shared][mine], rtol=1e-6)
 
 
+@pytest.mark.essential
 def test_temperatures_of_all_channels_are_those_of_one_gaussian(cube, expected, dense):
     """Means over pixels of all skies, with their full covariance, and what each unknown adds.
 
@@ -289,6 +292,7 @@ def test_temperatures_of_all_channels_are_those_of_one_gaussian(cube, expected, 
     assert spectrum.chi2("mean sky").chi2 == pytest.approx(expected_chi2, rel=1e-6)
 
 
+@pytest.mark.essential
 def test_theta_adds_the_variance_that_fixing_it_would_take_away(cube, expected):
     """Against the covariance of all skies and unknowns, conditioned with matrices."""
     for k, channel in enumerate(cube.channels):

@@ -6,7 +6,6 @@ from dataclasses import replace
 import healpy
 import numpy as np
 import pytest
-import xarray as xr
 from assertions import assert_same_map, refuse
 from astropy.io import fits
 from commands import posterior_of, refused, run, sets, sky_draws_of, table_of
@@ -54,7 +53,7 @@ def joint(tmp_path_factory):
 
 
 def test_channels_of_different_days(tmp_path):
-    """A run states the times of all; hours count from the first sample of any channel."""
+    """A run states the times of all, and that their observed skies differ."""
     days = {20.0: "2027-01-15", 25.0: "2027-01-16"}
     apart = three(frequencies="[20, 25]")
     starts = [(one, f"observation.start={days[one.frequency_mhz]}") for one in apart.channels()]
@@ -65,14 +64,6 @@ def test_channels_of_different_days(tmp_path):
     assert (
         said["first"][:10] == days[20.0] and said["last"] == data[1].observation.times[-1].isot[:19]
     )
-    file = tmp_path / "map" / "posterior.nc"
-    tree = xr.load_dataset(file, group="observed_data", engine="h5netcdf")
-    for number, (channel, begin) in enumerate(zip(data, (0.0, 24.0), strict=True)):
-        seen = tree["visibility"].isel(frequency=number).dropna("time")
-        hours = begin + channel.observation.hours
-        np.testing.assert_allclose(seen["time"], hours, rtol=0, atol=1e-3)
-        grid = seen.transpose("product", "time").to_numpy()
-        np.testing.assert_allclose(grid, channel.grid(), rtol=1e-12)
 
 
 @pytest.mark.long
