@@ -4,9 +4,12 @@ Draws of sky m and unknowns z from the Gaussian of an inference show what the fi
 q = v(m, z) - v_lin(m, z).
 
 **In N.** If q would move the mean map, C A^T N^-1 q, by 0.3 of its standard deviations or more, the
-mean of q is added to the model and its covariance to N. That is exact to second order: q, even in
+mean of q is added to the model and its covariance to N. Both are right to second order: q, even in
 the distance from the expansion point, is not correlated with the first order, which is odd. Turns
 of the antennas that the sky can follow need it: the posterior then curves with the turned sky m(z).
+
+**Other modes.** Such a valley may have two ends that fit. From both sides of the inferred values
+rounds lead to the other, which is named: the map is that of one.
 
 **Weights.** Draws get the ratio w of the exact density to the Gaussian's, ::
 
@@ -28,6 +31,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.engine import in_threads
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.model import base_model, systematics
 from lusee_bayes.experiment.rounds import Inference, less_moved, settled, solved_at
@@ -130,8 +134,11 @@ def with_other_modes(setup: Setup, inference: Inference) -> Inference:
     amplitudes, best = inference.amplitudes(part), inference
     middle, way = part.expected + amplitudes.mean, np.linalg.eigh(amplitudes.covariance)[1][:, -1]
     for step in STEPS:
-        values = {**around.values, **part.systematic.in_units(middle + step * way)}
-        found = settled(setup, solved_at(setup, Around(around.data, values=values)).around)
+        values = {**(around.values or {}), **part.systematic.in_units(middle + step * way)}
+        try:
+            found = settled(setup, solved_at(setup, Around(around.data, values=values)).around)
+        except InputError:  # the antennas cannot be turned that far
+            continue
         gained = float(found.posterior.log_evidence - best.posterior.log_evidence)
         if found.posterior.rms_shift_from(best.posterior.mean) > APART and gained > -RIVAL:
             named = ", ".join(f"{name} = {found.around.values[name]:.3g}" for name in turns)
