@@ -29,7 +29,8 @@ from lusee_bayes.systematics.systematic import Systematic
 # in the order in which they are applied to the model
 SYSTEMATICS: tuple[type[Systematic], ...] = (
     NoiseLevel, PriorSpectrum, BeamErrors, FieldErrors, Horizon, PointingOffsets, AboveLmax,
-    PointSources, Receivers, RegolithTemperature, Polarisation, GainTable, GainDrifts,
+    PointSources, Receivers, RegolithTemperature, Polarisation,
+    GainTable, GainDrifts,
 )  # fmt: skip
 
 _TERMS = {
