@@ -202,7 +202,7 @@ def reach(experiment: Experiment, inference: Inference, alone: bool = True) -> R
     wrong = moved_by >= LARGEST_MOVE
     keys = ", ".join(dict.fromkeys(part.systematic.key for part in inference.moving))
     if any(isinstance(part.systematic, SecondOrder) for part in inference.systematics):
-        notes.append(f"N contains the second order of {keys}: the first moves the map too far.")
+        notes.append(f"N contains the second order of {keys}: the first alone would bias the map.")
         more = f"What channels share of {keys} is not Gaussian: given all, errors may be too small."
         doubts += [more] * (not alone)
     if wrong or (alone and k > LARGEST_K):
