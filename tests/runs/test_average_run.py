@@ -8,6 +8,7 @@ from experiments import flagged
 
 import lusee_bayes as lb
 from lusee_bayes.cli.options import parse_duration
+from lusee_bayes.experiment.experiment import doubts
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.testing import small_scenario
@@ -85,6 +86,13 @@ def test_average_s_of_the_scenario_does_not_count(path, data, tmp_path):
     refuse("simulate a file", lb.run_map, given, tmp_path / "map")
     made = lb.run_average(given, path, 7200.0, tmp_path / "a.nc", information=False)
     assert made.data.observation.n_times == data.observation.n_times
+
+
+def test_gains_that_drift_within_samples_are_doubted(data):
+    """Means over half an hour; the gains are steady for a quarter of their correlation time."""
+    for hours, drift in ((1, True), (3, False)):
+        experiment = lb.build(scenario(f"noise.gain={{sigma: 1e-4, correlation_h: {hours}}}"), data)
+        assert drift == any("Gains drift" in x for x in doubts(experiment, lb.infer(experiment)))
 
 
 BAD_INPUT = [

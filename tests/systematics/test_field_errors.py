@@ -5,11 +5,12 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from assertions import close
+from assertions import close, refuse
 from experiments import differences, rms_of_directions
 from reference import real_harmonics
 
 import lusee_bayes as lb
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.experiment.experiment import doubts
@@ -18,6 +19,7 @@ from lusee_bayes.instrument.beams import fields as beam_fields
 from lusee_bayes.instrument.beams.fields import AntennaFields, HemisphereGrid, stokes_beam
 from lusee_bayes.instrument.products import to_real
 from lusee_bayes.results import finished_runs, summaries
+from lusee_bayes.runs import sample_run
 from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.field_errors import STD, FieldErrors, FieldErrorsSection, of_ell
 
@@ -188,3 +190,13 @@ def test_samples_of_measured_data_have_them_too(tmp_path):
     found, expected = lb.load_scenario(tmp_path / "run" / "scenario.yaml"), given.of_measured()
     assert found.noise.beam == expected.noise.beam is not None
     assert found.noise.fields == expected.noise.fields is not None
+
+
+def test_validations_of_measured_data_have_them_too(tmp_path, monkeypatch):
+    def stop(scenario, *_, **__):
+        raise InputError(f"{scenario.noise.fields}, {scenario.noise.above_lmax}")
+
+    monkeypatch.setattr(sample_run, "measured_experiment", stop)
+    given = lb.load_scenario("fiducial", ["lmax=2", "beam.exact=false", "observation.step_s=2e5"])
+    data = simulate(set_up(given)).write(tmp_path / "data.nc")
+    refuse("std=0.001.*margin=16", sample_run.run_validate, given, tmp_path / "run", data=data)
