@@ -316,18 +316,18 @@ def _fewer(setup: Setup, start: Around) -> tuple[Setup, Around] | None:
 
 def _nearby(setup: Setup, around: Around, report: Report, ways: int) -> tuple[Inference, _Step]:
     """Run rounds until the map has nearly converged; while it does not fit, restart elsewhere."""
-    best, step = _approached(setup, around, report)
+    best, step = approached(setup, around, report)
     stuck = int(best.around.tempered > 1.0)
     for way in range(ways):
         if best.moving and not (around.still or best.fits) and stuck < STUCK:
-            other = _approached(setup, _elsewhere(setup, best, way), report)
+            other = approached(setup, _elsewhere(setup, best, way), report)
             stuck += other[0].around.tempered > 1.0
             if other[0].posterior.log_evidence > best.posterior.log_evidence:
                 best, step = other
     return best, step
 
 
-def _approached(setup: Setup, around: Around, report: Report) -> tuple[Inference, _Step]:
+def approached(setup: Setup, around: Around, report: Report) -> tuple[Inference, _Step]:
     """Run rounds until the map has nearly converged; also return the last step."""
     inference, step, factors = _conditioned(setup, around, 1, None), _Step(), []
     moves, stalled = np.inf if rebuilds(setup) and not around.still else 0.0, False

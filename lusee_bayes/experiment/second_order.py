@@ -34,7 +34,7 @@ from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.model import base_model, systematics
-from lusee_bayes.experiment.rounds import Inference, less_moved, settled, solved_at
+from lusee_bayes.experiment.rounds import Inference, approached, less_moved, settled, solved_at
 from lusee_bayes.instrument.pointing import CLOCK, offset_kind
 from lusee_bayes.linear.amplitudes import AmplitudesOfSky
 from lusee_bayes.noise.covariance import LowRankFactor, LowRankUpdate
@@ -43,7 +43,7 @@ from lusee_bayes.systematics.systematic import LowRankNoise, Marginalised, with_
 
 # steps along the widest direction of clock and pointing, in prior standard deviations, and a mode:
 # so far is its map (rms, in standard deviations), and ln p at most so much lower
-STEPS, APART, RIVAL = (-2.0, -1.0, 1.0, 2.0), 3.0, 5.0
+STEPS, APART, RIVAL = (-2.0, 2.0), 3.0, 5.0
 # number of draws to weight, in total and first, of those that show whether the map would move, and
 # the largest k for a valid Gaussian
 N_WEIGHED, N_FIRST, N_FEW, LARGEST_K = 100, 25, 8, 0.7
@@ -136,7 +136,8 @@ def with_other_modes(setup: Setup, inference: Inference) -> Inference:
     for step in STEPS:
         values = {**(around.values or {}), **part.systematic.in_units(middle + step * way)}
         try:
-            found = settled(setup, solved_at(setup, Around(around.data, values=values)).around)
+            beside = solved_at(setup, Around(around.data, values=values)).around
+            found, _ = approached(setup, beside, lambda rounds, remark: None)
         except InputError:  # the antennas cannot be turned that far
             continue
         gained = float(found.posterior.log_evidence - best.posterior.log_evidence)
@@ -145,7 +146,8 @@ def with_other_modes(setup: Setup, inference: Inference) -> Inference:
             said = f"The data fit as well with {named}, and another map (ln p {gained:+.1f}): "
             said += "error bars are those of one of the two."
             if gained > RIVAL:
-                best, said = replace(found, learned=inference.learned), ""
+                best = replace(settled(setup, found.around), learned=inference.learned)
+                said = ""
             best = replace(best, unsettled=said)
     return best
 
@@ -183,11 +185,9 @@ def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float
     draws, factor = None, inference.solution.factor
     expected = np.concatenate([part.expected for part in inference.expanded] or [np.zeros(0)])
     for which in (range(N_FIRST), range(N_FIRST, N_WEIGHED)):
-        if (more := Draws.of(setup, inference, which)) is None:
+        if (new := Draws.of(setup, inference, which)) is None:
             return None
-        draws = (
-            more if draws is None else Draws(*map(np.concatenate, zip(draws, more, strict=True)))
-        )
+        draws = new if draws is None else Draws(*map(np.concatenate, zip(draws, new, strict=True)))
         left, whiten = (data - draws.linear).T, factor.base.whiten
         exact = whiten(left - draws.beyond.T)
         for part in inference.systematics:
