@@ -103,6 +103,7 @@ BEAMS = "lusee_bayes beams 1"
 GAINS = "lusee_bayes gains 1"
 REDUCED = "lusee_bayes reduced spectra 2"
 DIAGNOSTICS = "lusee_bayes diagnostics 4"
+SPECTRUM = "lusee_bayes spectrum 1"
 CHANNEL = "lusee_bayes unfinished channel 1"
 PAPER_CASE = "lusee_bayes paper case 1"
 

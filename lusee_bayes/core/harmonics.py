@@ -192,9 +192,9 @@ def pixel_matrix(nside: int, lmax: int) -> Float[np.ndarray, "pixels modes"]:
 LEFT_AT_LMAX = 0.1
 
 
-def taper(lmax: int) -> Float[np.ndarray, " ells"]:
-    """Return the beam's factor at ell = 0..lmax: exp(-ell (ell + 1) sigma^2 / 2)."""
-    ell = np.arange(lmax + 1)
+def taper(lmax: int, top: int | None = None) -> Float[np.ndarray, " ells"]:
+    """Return a map's beam at ell = 0..top (by default lmax): exp(-ell (ell + 1) sigma^2 / 2)."""
+    ell = np.arange((lmax if top is None else top) + 1)
     return LEFT_AT_LMAX ** (ell * (ell + 1.0) / max(lmax * (lmax + 1.0), 1.0))
 
 

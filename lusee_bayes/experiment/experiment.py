@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from lusee_bayes.core.arrays import Draws
+from lusee_bayes.core.arrays import Draws, Pixels
 from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
@@ -30,6 +30,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.second_order import with_other_modes, with_second_order
 from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.judge import measures
 from lusee_bayes.judge.plausibility import require_plausible
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
@@ -82,6 +83,14 @@ class Experiment(Described):
     def scenario(self) -> Scenario:
         """The scenario of the experiment."""
         return self.setup.scenario
+
+    @property
+    def highest_altitude(self) -> Pixels:
+        """The sine of the highest altitude of every pixel above the known terrain, at all data."""
+        horizon, observation = self.scenario.noise.horizon, self.data.observation
+        seen = np.asarray(self.data.layout.present).any(axis=0)
+        terrain = None if horizon is None else horizon.altitude_at
+        return measures.highest_altitude(observation, self.scenario.map_nside, seen, terrain)
 
 
 def build(

@@ -407,8 +407,8 @@ class Unknowns:
         InstrumentPosterior
         dict of (modes + sources, kept) arrays
             For each systematic, and all together, R of W V^-1 W^T = R R^T, the part of the
-            covariance of sky and fluxes that would vanish if it were known; that of fluxes only
-            for systematics other than the sources themselves.
+            covariance of sky, and of fluxes, that would vanish if it were known; that of fluxes
+            only for systematics other than the sources themselves.
         Fluxes
         """
         given, total = self.amplitudes.integrated(mean, covariance), float(np.trace(covariance))
@@ -426,9 +426,11 @@ class Unknowns:
 
         every, n = root(np.arange(len(rows))), len(mean)
         kinds = rows.groupby("systematic", sort=False).indices
-        parts = {ALL_TOGETHER: every} | {name: root(at) for name, at in kinds.items()}
-        for name in {ALL_TOGETHER, PointSources.words}.intersection(parts):
-            parts[name][n:] = 0.0
+        others = np.flatnonzero(rows["systematic"] != PointSources.words)
+        together = block_diag(every[:n], root(others)[n:])
+        parts = {ALL_TOGETHER: together} | {name: root(at) for name, at in kinds.items()}
+        if PointSources.words in parts:
+            parts[PointSources.words][n:] = 0.0
         moved = (rows["value"] - rows["prior"]) / rows["prior_std"]
         squares = rows.assign(unknown=rows["site"], n=1, moved=moved**2, width=given.std**2)
         groups = squares.groupby(["systematic", "unknown"], sort=False)

@@ -200,8 +200,8 @@ class SharedTest:
         Whether it stands out among all channels.
     shares : dict of float
         By unknown that all channels have in common: this channel's fraction of the information,
-        which is 1 / variance - 1 in prior units. Each channel is counted separately; zero if no
-        channel constrains the unknown.
+        which is 1 / variance - 1 in prior units. Each channel is counted separately; zero for one
+        that disagrees, and if no channel constrains the unknown.
     """
 
     frequency_mhz: float
@@ -268,6 +268,7 @@ def shared_tests(
         # if only two differ, either may be wrong
         agree = [k for k in agree if k != worst] if len(agree) > 2 else []
     alone = np.maximum(1.0 / np.diagonal(covariance, axis1=1, axis2=2) - 1.0, 0.0)
+    alone[np.setdiff1d(np.arange(len(alone)), agree)] = 0.0
     common = [i for i, kernel in enumerate(kernels) if (kernel == 1.0).all()]
     total = alone.sum(0)
     shares = np.divide(alone, total, out=np.zeros(alone.shape), where=total > 0)

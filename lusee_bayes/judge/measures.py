@@ -16,10 +16,10 @@ where the prior is too narrow, and smaller where it is too wide.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from lusee_bayes.core.arrays import Ells, Modes, Pixels, Vector
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, modes_to_map, sum_over_m
@@ -30,6 +30,7 @@ from lusee_bayes.judge.coverage import latitudes, multipoles
 from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior
 
+ALL = slice(None)
 # relative rounding of a difference of two quadratic forms
 ROUNDING = 1e-10
 
@@ -221,7 +222,12 @@ def expected_chi2(posterior: Posterior, n_data: int, variance: Modes | None = No
     return n_data - len(inverse) + float(np.vdot(inverse, inverse))
 
 
-def highest_altitude(observation: Observation, nside: int) -> Pixels:
+def highest_altitude(
+    observation: Observation,
+    nside: int,
+    seen: Bool[np.ndarray, " times"] | slice = ALL,
+    terrain: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> Pixels:
     """Compute the highest altitude that each pixel of the sky reached.
 
     Parameters
@@ -230,15 +236,24 @@ def highest_altitude(observation: Observation, nside: int) -> Pixels:
         Place and times.
     nside : int
         HEALPix resolution.
+    seen : (times,) array, optional
+        Whether a time has data; by default all have.
+    terrain : callable, optional
+        Altitude of the horizon at azimuths from North towards East, in radians; by default zero.
 
     Returns
     -------
     (pixels,) array
-        Sine of the altitude, of Galactic pixels in RING order. Negative where the sky never rose
-        above the horizon: there the map comes from the prior alone.
+        Sine of the altitude above the horizon, of Galactic pixels in RING order. Negative where the
+        sky never rose: there the map comes from the prior alone.
     """
     directions = np.array(healpy.pix2vec(nside, np.arange(healpy.nside2npix(nside))))
-    zeniths, highest = observation.zenith_galactic(), np.full(directions.shape[1], -1.0)
-    for chunk in np.array_split(zeniths, max(1, len(zeniths) // 256)):
-        np.maximum(highest, (chunk @ directions).max(axis=0), out=highest)
+    turns = observation.topocentric_from_mcmf() @ observation.mcmf_from_galactic[seen]
+    highest = np.full(directions.shape[1], -1.0)
+    for chunk in np.array_split(turns, max(1, len(turns) // 64)):
+        up = chunk[:, 2] @ directions
+        if terrain is not None:
+            above = terrain(np.arctan2(chunk[:, 0] @ directions, chunk[:, 1] @ directions))
+            up = np.sin(np.arcsin(np.clip(up, -1.0, 1.0)) - above)
+        np.maximum(highest, up.max(axis=0), out=highest)
     return highest

@@ -119,6 +119,17 @@ def describe_samples(path: Path) -> list[str]:
     ]
 
 
+def describe_spectrum(path: Path) -> list[str]:
+    """Describe temperatures of regions."""
+    with trees.opened_tree(path, formats.SPECTRUM, "temperatures of regions") as tree:
+        cls = resolve_name("lusee_bayes.results.sky_spectrum:SkySpectrum")
+        found = trees.from_tree(cls, tree, str(path))
+    first = f"temperatures of regions from {found.frequency[0]:g} to {found.frequency[-1]:g} MHz"
+    ends = zip(found.regions, found.temperature[:, 0], found.temperature[:, -1], strict=True)
+    return [first, *(f"{name}: {low:.6g} to {high:.6g} K" for name, low, high in ends)]
+
+
+TEXTS = {".ecsv", ".json", ".yaml", ".md", ".txt"}
 # the files that contain a verdict
 VERDICTS = ("summary.json", "priors.json")
 
@@ -171,6 +182,7 @@ DESCRIBED: dict[str, Callable[[Path], list[str]]] = {
     formats.POSTERIOR: describe_posterior,
     formats.DIAGNOSTICS: describe_diagnostics,
     formats.SAMPLES: describe_samples,
+    formats.SPECTRUM: describe_spectrum,
 }
 
 
@@ -192,8 +204,11 @@ def describe(path: str | Path) -> str:
         if kind in DESCRIBED:
             lines = DESCRIBED[kind](path)
         else:
-            reader = READERS.get(kind) or next(name for is_one, name in KINDS if is_one(path))
-            lines = [repr(resolve_name(f"lusee_bayes.{reader}")(path))]
-            lines += _cards(path) if formats.is_fits(path) else []
+            if Path(path).suffix in TEXTS:
+                raise InputError(f"{path} is a text: read it as it is")
+            lines = _cards(path) if formats.is_fits(path) else []
+            if not lines or not lines[0].startswith("index"):  # which is no sky
+                reader = READERS.get(kind) or next(name for is_one, name in KINDS if is_one(path))
+                lines = [repr(resolve_name(f"lusee_bayes.{reader}")(path)), *lines]
     first, *further = lines
     return "\n".join([f"{path}: {first}", *(f"  {line}" for line in further)])

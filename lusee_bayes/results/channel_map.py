@@ -314,7 +314,7 @@ class Conditioned:
         with stages("first order"):
             not_gaussian, harmless = reach(experiment, inference, alone)
         fitting = experiment.fitting
-        altitude = measures.highest_altitude(data.observation, scenario.map_nside)
+        altitude = experiment.highest_altitude
         if not joint:
             found["departure"] = Departure.of(altitude, self.posterior, *self._shared())
         return ChannelData(

@@ -92,8 +92,12 @@ def write_index_maps(result: MapResult, folder: Path) -> None:
     """Write maps of the spectral index as index.fits, the columns of a HEALPix file."""
     units, found = {"turnover": "MHz", "turnover_std": "MHz"}, result.index_maps()
     columns = [(name, pixels, units.get(name, "")) for name, pixels in found.maps.items()]
-    reference = {"FREQREF": (found.reference_mhz, "frequency of the index in MHz")}
-    _write_columns(folder / "index.fits", columns, cards("index", result.scenario) | reference)
+    fwhm = (
+        harmonics.taper_fwhm_deg(result.scenario.lmax),
+        "of the beam that smooths the skies, in degrees",
+    )
+    more = {"FREQREF": (found.reference_mhz, "frequency of the index in MHz"), "FWHM": fwhm}
+    _write_columns(folder / "index.fits", columns, cards("index", result.scenario) | more)
 
 
 def _write_columns(
@@ -302,7 +306,8 @@ def diagnostics_tree(result: MapResult) -> xr.DataTree:
 def spectrum_tree(result: MapResult) -> xr.DataTree:
     """Contents of spectrum.nc: temperatures of regions with the covariance of all frequencies."""
     tree = to_tree(result.sky_spectrum())
-    tree.attrs |= {"Conventions": "CF-1.13"} | attributes_of(result.scenario)
+    tree.attrs |= {"Conventions": "CF-1.13", "format": formats.SPECTRUM}
+    tree.attrs |= attributes_of(result.scenario)
     return tree
 
 

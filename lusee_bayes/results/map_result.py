@@ -26,7 +26,7 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import flux_lines
 from lusee_bayes.flight.reduced import Reduced
-from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
+from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit, in_brief
 from lusee_bayes.judge.cube_fit import ChannelFits, SharedTest
 from lusee_bayes.linear.joint import Blocks
 from lusee_bayes.linear.positive_joint import PositiveMode
@@ -221,10 +221,12 @@ class MapResult(Described):
         counts = [f"{name} (at {k} of {len(reports)} frequencies)" for name, k in weak.items()]
         what = f"do not constrain {', '.join(counts)}" if counts else "constrain all of them"
         lines = [f"Receivers, ground and gain table: the data {what}."]
+        apart = in_brief([f"{t.frequency_mhz:g} MHz" for t in self.shared_tests if t.disagrees])
+        but = f", except at {apart}" if apart else ""
         for words, octaves in self.scenario.shared.items():
             like = "the same" if np.isinf(octaves) else f"smooth over {octaves:g} octaves"
             given = "every channel uses the constraints from all others"
-            lines.append(f"Unknowns of {words} are {like} at all frequencies: {given}.")
+            lines.append(f"Unknowns of {words} are {like} at all frequencies{but}: {given}.")
         nulls = {f: report.null for f, report in reports.items() if report.null is not None}
         left_open = [f for f, null in nulls.items() if null.sentence()]
         if left_open:

@@ -18,7 +18,6 @@ from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.judge.convergence import warnings_of
-from lusee_bayes.judge.measures import highest_altitude
 from lusee_bayes.results.summaries import SamplingSummary, ValidationSummary
 from lusee_bayes.sampling import mode
 from lusee_bayes.sampling.validation import Check, Comparison, Ranks
@@ -83,8 +82,7 @@ class SampleResult:
     @cached_property
     def highest_altitude(self) -> Pixels:
         """sin of the highest altitude of every pixel."""
-        observation, scenario = self.experiment.data.observation, self.experiment.scenario
-        return highest_altitude(observation, scenario.map_nside)
+        return self.experiment.highest_altitude
 
     def headline(self) -> str:
         """The main figures, in one line."""

@@ -23,6 +23,7 @@ from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.leave_out import ARRAYS, MOST_MEMORY
 from lusee_bayes.experiment.rounds import first_order
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.instrument.pointing import CLOCK
 from lusee_bayes.instrument.visibilities import Visibilities
 
 # measured at lmax 12 to 80 and up to 3e5 data (docs/commands.md): memory before any computation,
@@ -145,7 +146,9 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
     if first_order(scenario):
         fields = scenario.noise.fields
         n_errors = 0 if fields is None else 16 * (fields.lmax + 1) ** 2
-        operations += IN_ROUNDS * n_channels * float(n_data) * (n_modes + n_errors)
+        kinds = () if scenario.noise.pointing is None else scenario.noise.pointing.kinds
+        searches = 3 if len({*kinds}.difference(CLOCK)) > 1 else 1
+        operations += searches * IN_ROUNDS * n_channels * float(n_data) * (n_modes + n_errors)
         squares += FIELD_ARRAYS * float(n_data) * n_errors
     if (above := scenario.noise.above_lmax) is not None:
         n_above = float(above.top(scenario.lmax) + 1) ** 2

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace as replace_fields
 from pathlib import Path
 
 import numpy as np
 
 from lusee_bayes.core.engine import Engine
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import Data, are_sessions, reduced_of, visibilities_of
+from lusee_bayes.experiment import data_files
+from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import REDUCED, Reduced, write_reduced
+from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.report.figures import judgement, maps
 from lusee_bayes.results import finished_runs
 from lusee_bayes.results.map_result import MapResult
@@ -72,12 +76,14 @@ def run_map(
     scenario = scenario if data is None else scenario.of_measured()
     stages = stages or Stages()
     scenario.require_marginal("a map", "use: lusee-bayes sample")
-    if not scenario.single:
+    if not scenario.single and data is None:
         require_resources(scenario, None, stages)
     origin = {"truth": truth or None, "earlier": earlier}
     with run_folder(folder, MAP, scenario, data, earlier, replace=replace, **origin) as run:
-        reduced = None if data is None else reduced_of(data, scenario, stages)
+        reduced = None if data is None else data_files.reduced_of(data, scenario, stages)
         given = _given(data, reduced, scenario, run.path)
+        if not scenario.single and given is not None:
+            require_resources(scenario, _first(given, scenario), stages)
         more = {"truth": truth, "earlier": earlier, "thorough": thorough, "engine": engine}
         made = map_channels(scenario, run.path, data=given, stages=stages, **more)
         known_sky = made.stacked("truth") is not None
@@ -94,12 +100,20 @@ def _given(
     if reduced is None:
         return data
     if scenario.single:
-        return visibilities_of(reduced, scenario)
-    if not are_sessions(data):
+        return data_files.visibilities_of(reduced, scenario)
+    if not data_files.are_sessions(data):
         return data
     path = folder / CHANNELS / REDUCED
     path.parent.mkdir(exist_ok=True)
     return write_reduced(path, reduced, scenario.to_yaml())
+
+
+def _first(data: Data, scenario: Scenario) -> Visibilities | None:
+    """The data of the first channel that has any."""
+    for channel in scenario.channels():
+        with suppress(InputError):
+            return data_files.read_data(data, channel)
+    return None
 
 
 def _as_used(reduced: Reduced, result: MapResult) -> Reduced:

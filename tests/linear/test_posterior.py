@@ -184,12 +184,14 @@ def test_expected_chi2_and_prior_fraction_per_ell():
     np.testing.assert_allclose(measures.prior_fraction_per_ell(post), expected, rtol=1e-10)
 
 
-def test_the_sky_that_never_rises_is_a_cap_round_the_north_pole():
+@pytest.mark.parametrize("terrain_deg", [0.0, 20.0])
+def test_the_sky_that_never_rises_is_a_cap_round_the_north_pole(terrain_deg):
     # from latitude -23.8 the Moon's north pole stays 23.8 degrees below the horizon; the site sees
     # all but a cap of that radius about it in one cycle (paper: "within ~24 degrees of the NCP")
     observation, nside = lb.Observation.from_runs([lb.Run()], step_s=3600.0), 32
-    hidden = measures.highest_altitude(observation, nside) < 0
-    radius = np.radians(-observation.lat_deg)
+    terrain = lambda azimuth: np.full(azimuth.shape, np.radians(terrain_deg))  # noqa: E731
+    hidden = measures.highest_altitude(observation, nside, terrain=terrain) < 0
+    radius = np.radians(terrain_deg - observation.lat_deg)
     expected = (1 - np.cos(radius)) / 2
     # pixels on the rim: 2 pi sin(radius) / pixel size of them, half a pixel each at worst
     rim = 2 * np.pi * np.sin(radius) * healpy.nside2resol(nside) / (4 * np.pi) / 2
@@ -197,6 +199,19 @@ def test_the_sky_that_never_rises_is_a_cap_round_the_north_pole():
     pole = observation.mcmf_from_galactic[:, 2].mean(axis=0)
     distance = np.arccos(np.array(healpy.pix2vec(nside, np.flatnonzero(hidden))).T @ pole)
     assert distance.max() < radius + 0.002  # the axis wanders by 0.0008 rad
+
+
+def test_what_never_rises_depends_on_times_with_data_and_on_terrain_by_azimuth():
+    observation = lb.Observation.from_runs([lb.Run()], step_s=14400.0)
+    seen = np.arange(observation.n_times) < 60
+    cut = measures.highest_altitude(observation.select(seen), 8)
+    np.testing.assert_array_equal(measures.highest_altitude(observation, 8, seen), cut)
+    wall = lambda azimuth: np.where(np.sin(azimuth) > 0.0, np.pi / 2.0, 0.0)  # noqa: E731
+    first = np.arange(observation.n_times) == 0
+    risen = measures.highest_altitude(observation, 8, first, wall) > 0
+    turned = observation.topocentric_from_mcmf() @ observation.mcmf_from_galactic[0]
+    east, _, up = turned @ np.array(healpy.pix2vec(8, np.arange(768)))
+    assert (risen == ((up > 0) & (east < 0))).all()
 
 
 def test_rows_of_the_resolution_are_what_the_map_shows_of_each_source():

@@ -173,7 +173,7 @@ def colour_bar(
         subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if narrow else (1.0, 2.0, 5.0)
         bar.set_ticks(LogLocator(subs=subs), minor=False)
         bar.set_ticks([], minor=True)
-        bar.long_axis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+        bar.long_axis.set_major_formatter(lambda value, _: f"{value:,.6g}")
     return bar
 
 
@@ -337,6 +337,11 @@ def _graticule(axes: Axes) -> None:
         axes.text(-EDGE[0] * x - 0.05, EDGE[1] * y, f"{lat:.0f}°", ha="right", **style)
 
 
-def shown(modes: Float[np.ndarray, " modes"], nside: int) -> Pixels:
-    """Synthesise the HEALPix RING map of packed coefficients, smoothed with the beam."""
-    return modes_to_map(modes * per_mode(taper(lmax_of(len(modes)))), nside)
+def shown(modes: Float[np.ndarray, " modes"], nside: int, lmax: int | None = None) -> Pixels:
+    """Synthesise the HEALPix RING map of packed coefficients, smoothed with a map's beam.
+
+    ``lmax`` is that of the map to which the beam belongs, by default that of the coefficients.
+    """
+    top = lmax_of(len(modes))
+    beam = taper(top if lmax is None else lmax, top)
+    return modes_to_map(modes * per_mode(beam), nside)

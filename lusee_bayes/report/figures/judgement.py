@@ -154,7 +154,7 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
         elif before.min() > BROAD * std.max() > 0.0:
             true = rows["true"].to_numpy() if "true" in rows else value
             low, high = np.minimum(value - 2 * std, true), np.maximum(value + 2 * std, true)
-            room = std.max()
+            room = max(std.max(), 0.05 * np.ptp(true))
             axes.set_ylim(low.min() - room, high.max() + room)
     for axes in panels.flat[len(unknowns) :]:
         axes.set_axis_off()

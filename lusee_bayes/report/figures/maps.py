@@ -69,7 +69,7 @@ def draws(result: MapResult) -> Panels | None:
         return None
     norm, nside = scales(channel)["temperature"], max(NSIDE, channel.nside)
     panels = {
-        f"draw {k}": (harmonics.modes_to_map(sky, nside), norm)
+        f"draw {k}": (drawing.shown(sky, nside), norm)
         for k, sky in enumerate(channel.details.draws, 1)
     }
     return drawing.sky_figures(panels, channel.highest_altitude)
@@ -254,7 +254,8 @@ def instrument_share(result: MapResult) -> Panels | None:
 def maps_of_runs(runs: Sequence[FinishedRun]) -> Panels:
     """Posterior mean and standard deviation of every run, on common scales."""
     channels = [run.channel for run in runs]
-    means = [drawing.shown(one.mean, max(NSIDE, one.nside)) for one in channels]
+    lmax = min(harmonics.lmax_of(len(one.mean)) for one in channels)
+    means = [drawing.shown(one.mean, max(NSIDE, one.nside), lmax) for one in channels]
     bounds = [drawing.seen_range(one.pixel_std, one.highest_altitude) for one in channels]
     spread = LogNorm(min(low for low, _ in bounds), max(high for _, high in bounds))
     level, figures = drawing.temperatures(np.concatenate(means)), {}
