@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from assertions import refuse
 from jinja2 import UndefinedError
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from matplotlib.projections.geo import MollweideAxes
 
 from lusee_bayes.core import harmonics
@@ -41,8 +43,17 @@ def test_a_map_of_longitude_and_latitude_comes_out_as_it_went_in():
 @pytest.mark.parametrize("lmax", [1, 8, 47])
 def test_the_taper_is_healpys_gaussian_beam(lmax):
     beam = healpy.gauss_beam(np.radians(harmonics.taper_fwhm_deg(lmax)), lmax)
+    np.testing.assert_allclose(harmonics.taper(lmax, lmax // 2), beam[: lmax // 2 + 1], rtol=1e-12)
     np.testing.assert_allclose(harmonics.taper(lmax), beam, rtol=1e-12)
     assert harmonics.taper(lmax)[-1] == pytest.approx(harmonics.LEFT_AT_LMAX)
+
+
+def test_a_bar_of_small_numbers_states_them():
+    figure = Figure()
+    image = figure.subplots().imshow([[0.04, 0.3]], norm=LogNorm(0.03, 0.44))
+    labels = drawing.colour_bar(figure, image, figure.axes[0]).ax.get_yticklabels()
+    shown = [float(one.get_text()) for one in labels]
+    assert {0.03, 0.05, 0.1, 0.2} <= set(shown)
 
 
 def test_a_sky_of_one_mode_is_shown():

@@ -95,6 +95,7 @@ def test_channels_that_disagree_are_those_that_are_wrong(wrong):
         assert (tests[k].chi2, tests[k].degrees) == (pytest.approx(expected, rel=1e-5), len(own))
         assert tests[k].p == pytest.approx(chi2.sf(expected, len(own)), rel=1e-4)
     told = 1.0 / np.diagonal(covariance, axis1=1, axis2=2) - 1.0
+    told[wrong] = 0.0
     shares = [[one.shares[name] for name in "ac"] for one in tests]
     within(shares, (told / told.sum(0))[:, [0, 2]], 1e-12)
     assert all(len(one.shares) == 2 for one in tests)
@@ -280,6 +281,12 @@ def test_temperatures_of_all_channels_are_those_of_one_gaussian(cube, expected, 
     gone, share = np.diagonal(gone) / expected.std[at] ** 2, spectrum.shares[:, k]
     np.testing.assert_allclose(share[spectrum.sources.index("the beams")], gone, rtol=1e-4)
     assert not share[spectrum.sources.index("the sources")].any()
+    together = share[spectrum.sources.index(ALL_TOGETHER)]
+    for number, mine in enumerate(at):
+        others = 3 * N_MODES + np.r_[:4, 4 + OWN * number + RECEIVERS]
+        cross = expected.covariance[mine, others]
+        gone = cross @ np.linalg.solve(expected.covariance[np.ix_(others, others)], cross)
+        assert together[number] == pytest.approx(gone / expected.std[mine] ** 2, rel=1e-4)
     # its errors at two frequencies are alike
     assert (np.abs(covariance[0, 1:] / scale[0] / scale[1:]) > 0.01).any()
     header, rows = spectrum.rows("Cas A")

@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 from assertions import refuse, within
 from astropy import units as u
+from astropy.io import fits
 from astropy.table import Table
 from commands import run
 
@@ -106,6 +107,14 @@ def test_files_have_the_spectrum_with_its_covariance(joint, tmp_path, capsys):
         # between the end frequencies: the embedded sky has little curvature there
         slope = np.log(true[-1] / true[0]) / np.log(30.0 / 18.0)
         assert np.mean(np.abs(index - slope) < 2.0 * std + 0.02) > 0.9 and np.median(std) < 0.1
+        width = fits.getheader(tmp_path / "cube" / "index.fits", 1)["FWHM"]
+        within(healpy.gauss_beam(np.radians(width), 4) - taper(4), 0.0, 1e-12)
+    named = ["spectrum.nc", *["index.fits"] * bool(joint)]
+    assert run("info", *[tmp_path / "cube" / name for name in named]) == 0
+    printed = capsys.readouterr().out
+    assert f"mean sky: {spectrum.temperature[0, 0]:.6g} to " in printed and "SkyMap" not in printed
+    assert run("info", tmp_path / "cube" / "spectrum.ecsv") == 2
+    assert "is a text" in capsys.readouterr().err
 
 
 def spectrum_of(f, temperature, covariance):

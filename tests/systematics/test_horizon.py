@@ -19,6 +19,7 @@ from lusee_bayes.core.harmonics import synthesis_matrix, turn_about_z
 from lusee_bayes.experiment import experiment
 from lusee_bayes.experiment import model as models
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
+from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.systematics import context, systematic
 
 LMAX, ANGLES, TREATMENTS = 8, (0.0, 40.0), ("marginalised", "ignored")
@@ -167,6 +168,20 @@ def test_other_beams_are_behind_the_terrain_too():
     exact = models.moved(setup, {"beam_amplitude": 1.0}).coupling
     change = np.linalg.norm((exact @ setup.sky.modes) - setup.coupling @ setup.sky.modes)
     assert np.linalg.norm((got @ setup.sky.modes) - exact @ setup.sky.modes) < 1e-9 * change
+
+
+def test_what_never_rises_is_behind_the_terrain_or_has_no_data():
+    hidden = "altitude_deg: 20, std_deg: 1"
+    made = experiment.observed(scenario(hidden, "nside=16", lmax=2, step_s=2e4))
+    # within 23.8 + 20 degrees of the pole; half a pixel each on the rim
+    assert (made.highest_altitude < 0).mean() == pytest.approx(0.139, abs=0.02)
+    keep = np.arange(made.data.observation.n_times) < 40
+    layout = DataLayout.from_flags(np.tile(~keep, (16, 1)))
+    data = layout.gather(made.data.grid())
+    flagged = replace(made, data=replace(made.data, data=data, layout=layout))
+    few = replace(made, data=made.data.select(keep))
+    np.testing.assert_array_equal(flagged.highest_altitude, few.highest_altitude)
+    assert (few.highest_altitude < 0).mean() > 0.2
 
 
 def test_what_cannot_be(tmp_path):
