@@ -47,6 +47,8 @@ from lusee_bayes.judge.split import WIDER, beside_any_sky
 from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.noise_level import NoiseLevel
+from lusee_bayes.systematics.registered import SYSTEMATICS
 
 # recurring array types
 Products = Float[np.ndarray, " products"]
@@ -486,11 +488,14 @@ class Diagnosis:
         explain nearly all of the excess chi^2.
     n_tried : int
         Number of mistakes tried.
+    absent : tuple of str
+        Systematics that the model does not have.
     """
 
     chi2: ChiSquare
     proposals: tuple[Proposal, ...]
     n_tried: int
+    absent: tuple[str, ...] = ()
 
     @property
     def is_truncation(self) -> bool:
@@ -502,7 +507,8 @@ class Diagnosis:
         if not self.proposals and self.chi2.fits:
             return [f"As a whole, the data fit without assuming a mistake ({self.chi2.words()})."]
         if not self.proposals:
-            return [f"None of the {self.n_tried} usual mistakes explains the misfit."]
+            others = f" The model has no {', '.join(self.absent)}: try them." if self.absent else ""
+            return [f"None of the {self.n_tried} usual mistakes explains the misfit.{others}"]
         first = f"Explains most of chi2 {self.chi2.chi2:.4g} of the instrument as expected"
         first = "Did you mean" if self.proposals[0].explains else first
         return [f"{first}:"] + [
@@ -588,7 +594,9 @@ def _tried(judge: UnderAnySky, residuals: Residuals, unused: float = 0.0) -> Dia
     better = [replace(one, chi2=one.chi2.allowing(unused)) for one in better]
     better = sorted(better, key=lambda one: (-one.chi2.p, one.chi2.chi2))
     n_tried = len(of_data) + len(of_model) + len(others)
-    return Diagnosis(base.allowing(unused), tuple(_merged(better)), n_tried)
+    absent = [cls.key for cls in SYSTEMATICS if cls.treatment(setup.scenario) is None]
+    absent = tuple(k for k in absent if k.startswith("noise.") and k != NoiseLevel.key)
+    return Diagnosis(base.allowing(unused), tuple(_merged(better)), n_tried, absent)
 
 
 def _noise_of(judge: UnderAnySky, form: str) -> Iterator[Proposal]:

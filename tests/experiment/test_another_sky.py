@@ -365,6 +365,7 @@ def test_all_wrong_data_make_a_map_and_most_causes_are_named():
         left, found = diagnosed(wrong)
         assert left.level() == "does not fit", wrong.name
         assert not any(proposal.explains for proposal in found.proposals), wrong.name
+        assert found.proposals or "The model has no noise.fields, noise." in found.sentences()[0]
 
 
 @pytest.mark.long
