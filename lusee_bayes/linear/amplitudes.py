@@ -41,6 +41,17 @@ the other channels' constraint on its amplitudes, exp(-x^T Q x / 2 + q^T x) with
 
     Q = V'^-1 - V^-1,    q = V^-1 (E' - E).
 
+*Skies that are alike* make errors alike. The score V_k^-1 E_k has the variance J_k = V_k^-1 - 1,
+and the slope P_k = -V_k^-1 Cov(z_k, m_k) G_k^-T by the departure u_k of a sky m_k = mu_k + G_k u_k
+from its prior. If departures have the correlation rho, the sum of all R_k^T V_k^-1 E_k has the
+slope J = sum_k R_k^T J_k R_k by w, and the variance J + X with the sum X over k != l of
+rho_kl R_k^T P_k P_l^T R_l. The best estimate from this sum is ::
+
+    Lambda = 1 + J (J + X)^-1 J,    mean of w = Lambda^-1 J (J + X)^-1 sum_k R_k^T V_k^-1 E_k,
+
+without the negative part of X (relative to 1 + J), by which errors would cancel. Otherwise what all
+channels learn from their priors of one sky, such as where the Galaxy is, would count many times.
+
 If N has a prior mean e, to make up for the volume of skies (:mod:`.systematic`), z^T e belongs to
 the likelihood (the volume at that z), not to the prior: the equations are valid with the E of
 N(e, 1). About e, as for :class:`Amplitudes`, E - e and E' - e replace E and E'.
@@ -74,6 +85,8 @@ Skies = Float[np.ndarray, "skies modes"]
 PatternModes = Float[np.ndarray, "patterns modes"]
 
 
+# information about an amplitude, over all, that is none
+NEGLIGIBLE = 1e-12
 # leading data that are compared first, to find a column among many
 FEW = 8
 
@@ -405,7 +418,8 @@ class Tied:
     draws : (draws, channels, n) array
         Of all channels together.
     log_evidence : float
-        ln p of all data, minus the sum of the channels' ln p with amplitudes N(0, 1).
+        ln p of all data, minus the sum of the channels' ln p with amplitudes N(0, 1); of skies that
+        are independent.
     names : tuple of str
         Of the amplitudes, if they have names.
     """
@@ -451,11 +465,50 @@ def root_of_kernels(
     return blocks
 
 
+@dataclass(frozen=True)
+class AlikeErrors:
+    """Errors of the scores V_k^-1 E_k that channels have in common, since their skies are alike.
+
+    Attributes
+    ----------
+    slopes : (channels, n, modes) array
+        P_k: of the scores, by the sky's departure from the prior, in prior standard deviations.
+    correlation : (channels, channels) array
+        rho, of these departures.
+    """
+
+    slopes: Float[np.ndarray, "channels n modes"]
+    correlation: Float[np.ndarray, "channels channels"]
+
+    def weighed(
+        self,
+        blocks: Float[np.ndarray, "channels n white"],
+        white: Float[np.ndarray, " white"],
+        lower: Float[np.ndarray, "white white"],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and root of the precision of w, from those for independent errors."""
+        seen = np.einsum("kiw,kim->kwm", blocks, self.slopes)
+        seen = solve_lower(lower, np.concatenate(seen, axis=1), transpose=False)
+        seen = seen.reshape(len(lower), len(blocks), -1)
+        apart = self.correlation - np.diag(np.diagonal(self.correlation))
+        values, axes = np.linalg.eigh(np.einsum("wkm,kj,vjm->wv", seen, apart, seen, optimize=True))
+        more, one = (axes * np.maximum(values, 0.0)) @ axes.T, np.eye(len(lower))
+        half = solve_lower(lower, one, transpose=False)
+        told = one - half @ half.T
+        mixed = np.linalg.solve(told + more + NEGLIGIBLE * one, told)
+        kept = one - told + told @ mixed
+        kept = 0.5 * (kept + kept.T)
+        least = np.linalg.solve(kept, mixed.T @ (lower.T @ white))
+        mean = solve_lower(lower, least[:, None], transpose=True)[:, 0]
+        return mean, lower @ np.linalg.cholesky(kept)
+
+
 def tie(
     mean: Float[np.ndarray, "channels n"],
     covariance: Float[np.ndarray, "channels n n"],
     kernels: Float[np.ndarray, "n channels channels"],
     normals: Float[np.ndarray, "draws most"],
+    alike: AlikeErrors | None = None,
 ) -> Tied:
     """Replace the independent priors of channels' amplitudes by one that ties them.
 
@@ -467,6 +520,8 @@ def tie(
         K_i, with ones on their diagonals; they may be singular.
     normals : (draws, channels * n) array
         Standard normals for the draws; of each, one per column of R is used.
+    alike : AlikeErrors, optional
+        What the channels' skies add to all scores; without, errors are independent.
 
     Raises
     ------
@@ -488,10 +543,13 @@ def tie(
         step = solve_lower(lower, solve_lower(lower, left, transpose=False), transpose=True)
         white = white + step[:, 0]
         z = (root @ white).reshape(mean.shape)
-    half = solve_lower(lower, root.T, transpose=False).T.reshape(n_channels, n, -1)
-    draws = solve_lower(lower, normals[:, : root.shape[1]].T, transpose=True).T @ root.T
     off = mean - z
     quadratic = np.einsum("ki,kij,kj->", off, inverse, off) - (z**2).sum() + white @ white
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
-    drawn, evidence = z + draws.reshape(-1, n_channels, n), float(-0.5 * (quadratic + log_dets))
-    return Tied(z, half, white, blocks, drawn, evidence)
+    evidence = float(-0.5 * (quadratic + log_dets))
+    if alike is not None:
+        white, lower = alike.weighed(blocks, white, lower)
+    half = solve_lower(lower, root.T, transpose=False).T.reshape(n_channels, n, -1)
+    z = (root @ white).reshape(mean.shape)
+    draws = solve_lower(lower, normals[:, : root.shape[1]].T, transpose=True).T @ root.T
+    return Tied(z, half, white, blocks, z + draws.reshape(-1, n_channels, n), evidence)

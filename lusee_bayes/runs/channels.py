@@ -56,14 +56,14 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
-from lusee_bayes.linear.amplitudes import Tied, kernel, tie
+from lusee_bayes.linear.amplitudes import AlikeErrors, Tied, kernel, tie
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
 from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
-from lusee_bayes.results.sky_spectrum import N_DRAWS, combined
+from lusee_bayes.results.sky_spectrum import N_DRAWS, Departure, combined, correlation
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import identity_of
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -343,9 +343,11 @@ class Share:
     priors: dict[str, tuple[float, float]]
     fits: bool
     log_evidence: float
+    slopes: Float[np.ndarray, "unknown mode"] | None = None
+    departure: Float[np.ndarray, " mode"] | None = None
 
     @classmethod
-    def of(cls, made: Conditioned, n_draws: int = 0) -> Share:
+    def of(cls, made: Conditioned, n_draws: int = 0, departure: Departure | None = None) -> Share:
         """Make it from a channel: its unknowns, and its posterior of the sky."""
         unknowns, inferred = made.unknowns, made.from_data
         posterior = unknowns.amplitudes.integrated(made.posterior.mean, made.covariance)
@@ -354,7 +356,12 @@ class Share:
         priors = {row["unknown"]: (row["prior"], row["prior_std"]) for row in unknowns.rows}
         spread = posterior.covariance[np.ix_(shared, shared)]
         figures = n_draws, priors, inferred.fits, float(inferred.posterior.log_evidence)
-        return cls(octaves, (unknowns.expected + posterior.mean)[shared], spread, *figures)
+        parts = octaves, (unknowns.expected + posterior.mean)[shared], spread, *figures
+        if departure is None:
+            return cls(*parts)
+        slopes = np.linalg.solve(spread, -posterior.with_sky[:, shared].T)
+        slopes = np.asarray(made.posterior.prior.whiten(slopes))
+        return cls(*parts, slopes, departure.mean)
 
 
 class Seen(NamedTuple):
@@ -402,7 +409,12 @@ class ChannelAlone:
         deviations = made.draws - mean
         if compared is not None:
             deviations = np.concatenate([deviations, compared])
-        kept = made.covariance, deviations, made.figures(), Share.of(made, len(deviations))
+        kept = (
+            made.covariance,
+            deviations,
+            made.figures(),
+            Share.of(made, len(deviations), data.departure),
+        )
         return cls(data, made.from_data.solution.information, made.unknowns, mean, *kept)
 
     def seen(self) -> Seen:
@@ -500,11 +512,19 @@ def tie_channels(
     normals = np.asarray(jax.random.normal(key, (shared[0].n_draws, mean.size)))
     kernels = np.stack([kernel(np.array(frequencies_mhz), over) for over in octaves.values()])
     tests = shared_tests(mean, covariance, kernels, names, frequencies_mhz)
+    alike = None
+    if all(one.departure is not None for one in shared):
+        slopes = np.zeros((*mean.shape, len(shared[0].departure)))
+        for number, one in enumerate(shared):
+            slopes[number, [names.index(name) for name in one.octaves]] = one.slopes
+        alike = AlikeErrors(slopes, correlation(np.stack([one.departure for one in shared])))
     for number, test in enumerate(tests):
         if test.disagrees:
             kernels[:, number], kernels[:, :, number] = 0.0, 0.0
             kernels[:, number, number] = 1.0
-    return replace(tie(mean, covariance, kernels, normals), names=names), tests
+            if alike is not None:
+                alike.correlation[number], alike.correlation[:, number] = 0.0, 0.0
+    return replace(tie(mean, covariance, kernels, normals, alike), names=names), tests
 
 
 def from_fitting(
