@@ -46,6 +46,14 @@ def ties(frequencies) -> np.ndarray:
     return np.exp(-0.5 * (np.log2(frequencies[:, None] / frequencies) / OCTAVES) ** 2)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def independent():
+    """Skies as independent as the oracle's; test_shared_instrument.py has those that are alike."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(channels, "correlation", lambda u: np.eye(len(u)))
+        yield
+
+
 @pytest.fixture(scope="module")
 def scenario(response_file):
     return cube_of(response_file, NOISE, RECEIVER, GROUND, f"output={{draws: {N_DRAWS}}}")
