@@ -11,10 +11,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import checks, harmonics, linalg
+from lusee_bayes.core import checks, harmonics, lazy, linalg
 from lusee_bayes.core.arrays import Array, Fields, as_complex, namespace
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.lazy import special
 
 
 class SphereGrid(eqx.Module):
@@ -59,7 +58,7 @@ class SphereGrid(eqx.Module):
         x, weights = np.polynomial.legendre.leggauss(band + 1)
         theta, n_phi = np.arccos(x), 2 * band + 2
         # ells, orders, rings
-        table = special.sph_legendre_p_all(lmax, lmax, theta)[0][:, : lmax + 1]
+        table = lazy.special.sph_legendre_p_all(lmax, lmax, theta)[0][:, : lmax + 1]
         table = np.ascontiguousarray(table.transpose(1, 2, 0))
         table[1:] *= harmonics.SQRT2
         return cls(theta, weights * (2.0 * np.pi / n_phi), table, n_phi)

@@ -9,22 +9,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import T
+from lusee_bayes.core import arrays, formats, trees
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, parse_yaml, require_file
-from lusee_bayes.core.trees import opened_tree
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.flight import flags, reduction, session_files
 from lusee_bayes.flight.clock import read_clock
-from lusee_bayes.flight.flags import read_lines
 from lusee_bayes.flight.gain_model import GainModel, read_gain_table, synthetic_gains
 from lusee_bayes.flight.recipe import FlightSection, Recipe
 from lusee_bayes.flight.reduced import Reduced, read_reduced
-from lusee_bayes.flight.reduction import reduce_sessions
 from lusee_bayes.flight.session import PORTS
-from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.times import Timestamp
@@ -151,7 +147,7 @@ def reduced_of(data: Data, scenario: Scenario, stages: Stages | None = None) -> 
 
 def _require_same_reduction(path: Path, scenario: Scenario) -> None:
     """Raise InputError for settings, other than the defaults, that differ from a reduction's."""
-    with opened_tree(path, formats.REDUCED, "reduced spectra", HINT) as tree:
+    with trees.opened_tree(path, formats.REDUCED, "reduced spectra", HINT) as tree:
         made = parse_yaml(str(tree.attrs.get("scenario", "")), f"{path}: its scenario") or {}
     whole = scenario.model_dump(mode="json", exclude_defaults=True)
     for section, keys in OF_REDUCTION.items():
@@ -219,7 +215,7 @@ def _is_waterfall(path: Path) -> bool:
     return is_waterfall
 
 
-def _nearest(sets: Sequence[T], frequency_mhz: float) -> T:
+def _nearest(sets: Sequence[arrays.T], frequency_mhz: float) -> arrays.T:
     """The only set or file, or that at a frequency. InputError if there is none, or several."""
     if len(sets) == 1:
         return sets[0]
@@ -236,7 +232,7 @@ def _nearest(sets: Sequence[T], frequency_mhz: float) -> T:
 
 def _frequency_of(path: Path) -> float:
     """The frequency of a file of visibilities, in MHz; the rest of the file is not read."""
-    with opened_tree(path, formats.VISIBILITIES, "data", HINT) as tree:
+    with trees.opened_tree(path, formats.VISIBILITIES, "data", HINT) as tree:
         return float(tree.attrs.get("frequency_mhz", np.nan))
 
 
@@ -329,8 +325,8 @@ def reduce_files(
             raise InputError(f"'{paths[k]}' is reduced already; give it to lusee-bayes map --data")
     recipe = recipe_of(scenario)
     with stages("sessions"):
-        sessions = [read_session(path) for path in paths]
-    return reduce_sessions(sessions, recipe, stages)
+        sessions = [session_files.read_session(path) for path in paths]
+    return reduction.reduce_sessions(sessions, recipe, stages)
 
 
 def recipe_of(scenario: Scenario) -> Recipe:
@@ -364,7 +360,7 @@ def recipe_of(scenario: Scenario) -> Recipe:
     observation = scenario.observation
     frequencies = scenario.frequencies_mhz or (scenario.frequency_mhz,)
     parts = section, gain_table_of(section), timestamp, frequencies, observation.average_s
-    lines = () if section.lines is None else read_lines(section.lines)
+    lines = () if section.lines is None else flags.read_lines(section.lines)
     clock = None if section.clock is None else read_clock(section.clock)
     site = (observation.lon_deg, observation.lat_deg) if section.site == "scenario" else None
     return Recipe(*parts, lines, clock, site)

@@ -22,26 +22,22 @@ from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment import rounds
-from lusee_bayes.experiment.diagnosis import is_mistaken
+from lusee_bayes.experiment import diagnosis, rounds
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.second_order import with_other_modes, with_second_order
 from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge import measures
-from lusee_bayes.judge.plausibility import require_plausible
+from lusee_bayes.judge import measures, plausibility
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.radiometer import of_voltages
 from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
-from lusee_bayes.systematics.beam import BeamErrors
+from lusee_bayes.systematics import beam, noise_level, sources
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities
 from lusee_bayes.systematics.gain_drifts import GainDrifts, drift_within
-from lusee_bayes.systematics.noise_level import radiometer_about
-from lusee_bayes.systematics.sources import PointSources
 from lusee_bayes.systematics.systematic import Systematic
 
 
@@ -156,7 +152,7 @@ def observed(
         setup = set_up(scenario.with_section("noise", above_lmax=None), data, stages)
         doubts.append(f"The sky above lmax = {scenario.lmax} is not in the model: {error}.")
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    doubts += require_plausible(data, setup.signal, std)
+    doubts += plausibility.require_plausible(data, setup.signal, std)
     gains_known = data.calibration is not None and data.calibration.gain_names
     if gains_known and scenario.noise.gain_table is None:
         doubts.append("The stated errors of the gains are not part of N: give noise.gain_table={}.")
@@ -187,7 +183,7 @@ def _searchable(experiment: Experiment, start: Around, stages: Stages) -> tuple[
     words = "A mistake explains most of the misfit, and the instrument's unknowns stay as expected."
     # numbers that rounding rules are no reason to end
     with stages("usual mistakes"), suppress(InputError):
-        if is_mistaken(setup, start):
+        if diagnosis.is_mistaken(setup, start):
             said = *experiment.doubts, words
             return replace(experiment, doubts=said), replace(start, still=True)
     return experiment, start
@@ -279,7 +275,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
         return cls.build(attrgetter(cls.key)(experiment.scenario), setup, around())
 
     def instrument() -> Instrument:
-        require_free(BeamErrors)
+        require_free(beam.BeamErrors)
         if not setup.beam_source.parameters():
             raise InputError("the program needs the embedded antennas; remove beam.file")
         return setup.instrument
@@ -295,7 +291,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
         "systematics": lambda: to_sample()[1],
         "gain_drifts": lambda: built(GainDrifts),
         "instrument": instrument,
-        "sources": lambda: built(PointSources),
+        "sources": lambda: built(sources.PointSources),
         "layout": lambda: data.layout,
     }
 
@@ -394,7 +390,7 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
     if said := drift_within(setup.scenario.noise.gain, setup.observation):
         notes.append(f"{said[0].upper()}{said[1:]}.")
     if setup.scenario.noise.radiometer.form == "exact":
-        seen = noise_visibilities(setup, inference.around, radiometer_about(setup))
+        seen = noise_visibilities(setup, inference.around, noise_level.radiometer_about(setup))
         if not (known := np.asarray(of_voltages(seen))).all():
             notes.append(
                 f"At {(~known).sum()} of {counted(len(known), 'time')} no voltages of independent "

@@ -18,9 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import checks, section
+from lusee_bayes.core import checks, lazy, section
 from lusee_bayes.core.arrays import Grid, GridFlags, Vector
-from lusee_bayes.core.lazy import special
 from lusee_bayes.core.progress import Stages, memory_limit
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.rounds import rebuilds, settled
@@ -97,7 +96,7 @@ class GroupsCompared:
         squares = self.z**2
         most, product = squares.max(axis=0), squares.argmax(axis=0)
         tail = _tail(self.chi2, self.degrees)
-        single = np.where(self.degrees > 0.0, special.chdtrc(1.0, most), 1.0) * len(squares)
+        single = np.where(self.degrees > 0.0, lazy.special.chdtrc(1.0, most), 1.0) * len(squares)
         out = (tail < false_alarm) | (single < false_alarm)
         out &= self.size >= max(WORST * self.size.max(), least)
         others = _tail(self.chi2 - most, self.degrees - 1.0)
@@ -135,7 +134,7 @@ def _judged(missed: list[Missed]) -> tuple[Vector, Vector]:
 
 def _tail(chi2: Vector, degrees: Vector) -> Vector:
     """Probability of this chi^2 or more; 1 where there are no degrees of freedom."""
-    return np.where(degrees > 0.0, special.chdtrc(degrees, np.maximum(chi2, 0.0)), 1.0)
+    return np.where(degrees > 0.0, lazy.special.chdtrc(degrees, np.maximum(chi2, 0.0)), 1.0)
 
 
 def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> GroupsCompared:

@@ -27,12 +27,11 @@ from lusee_bayes.noise.covariance import LowRankFactor, LowRankUpdate
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, averaged_beyond, learn_whatever_fits
 from lusee_bayes.sky.prior import IndependentPrior, Prior
+from lusee_bayes.systematics import noise_level, registered
 from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.context import Around, Setup, Volume
 from lusee_bayes.systematics.gain_drifts import GainDrifts, gains_about
-from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
-from lusee_bayes.systematics.registered import present
 from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic
 
 # N is rebuilt until the map moves by less than this (rms, in standard deviations)
@@ -506,7 +505,7 @@ def first_order(scenario: Scenario) -> tuple[type[Systematic], ...]:
     """Systematics that are expanded to first order around values inferred from the data."""
     return tuple(
         cls
-        for cls, section in present(scenario)
+        for cls, section in registered.present(scenario)
         if cls.treatment(scenario) != "ignored" and cls.in_rounds(section)
     )
 
@@ -520,7 +519,7 @@ def as_expected(setup: Setup) -> Setup:
 def rebuilds_visibilities(setup: Setup) -> bool:
     """Whether gains or radiometer noise are built around the posterior's prediction."""
     gains = is_modelled(setup.scenario.noise.gain) and gains_about(setup) == "posterior"
-    return gains or radiometer_about(setup) == "posterior"
+    return gains or noise_level.radiometer_about(setup) == "posterior"
 
 
 def prediction(setup: Setup, inference: Inference, solved: DataVector) -> Grid:

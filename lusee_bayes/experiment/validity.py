@@ -20,11 +20,10 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Modes
+from lusee_bayes.experiment import rounds, unknowns
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, moved
-from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.second_order import LARGEST_K, LARGEST_MOVE, SecondOrder, weighed
-from lusee_bayes.experiment.unknowns import tested_offsets
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.systematics.beam import InstrumentParameters
 from lusee_bayes.systematics.context import Around, Setup
@@ -127,7 +126,7 @@ def errors_of(setup: Setup, model: LinearGaussian, sky: Modes, has: set[str]) ->
     if priors:
         sizes = {unknown.name: 100.0 * PARAMETERS for unknown in priors}
         yield sizes, " %", 1, columns(InstrumentParameters(priors, setup.instrument))
-    steps = {name: step for name, step in tested_offsets(setup).items() if name not in has}
+    steps = {name: step for name, step in unknowns.tested_offsets(setup).items() if name not in has}
     if steps:
         steps |= {"clock_s": CLOCK_S} if "clock_s" in steps else {}
         yield steps, "", 1, columns(PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0)))
@@ -139,7 +138,7 @@ def errors_of(setup: Setup, model: LinearGaussian, sky: Modes, has: set[str]) ->
         yield {"horizon_deg": TERRAIN_DEG}, "", 3, more[:, None]
 
 
-def blind_spots(setup: Setup, inference: Inference, sky: Modes) -> tuple[BlindSpot, ...]:
+def blind_spots(setup: Setup, inference: rounds.Inference, sky: Modes) -> tuple[BlindSpot, ...]:
     """Compute the effect of instrument errors that the model does not include.
 
     Parameters
@@ -186,7 +185,7 @@ def about_sky_above(setup: Setup) -> list[str]:
     ]
 
 
-def reach(experiment: Experiment, inference: Inference, alone: bool = True) -> Reach:
+def reach(experiment: Experiment, inference: rounds.Inference, alone: bool = True) -> Reach:
     """Doubts about the Gaussian; and notes, on errors that data would not reveal. A sentence each.
 
     Parameters

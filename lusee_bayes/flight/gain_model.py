@@ -21,12 +21,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import formats
+from lusee_bayes.core import formats, lazy
 from lusee_bayes.core.checks import Described, extent, require_positive, require_shape
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.layouts import Layout, Variable, require_mhz
-from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.core.reading import read_table, reading, require_file
 from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
 from lusee_bayes.flight.session import LETTERS, PORTS, TELEMETRY, PortLevels, Telemetry
@@ -112,7 +111,7 @@ class GainModel(Described):
         """
         place = LETTERS.index(level), port
         curves = np.vstack([self.mean[place], self.components[place]])
-        spline = interpolate.CubicSpline(self.anchor_mhz[place], curves.T, extrapolate=False)
+        spline = lazy.interpolate.CubicSpline(self.anchor_mhz[place], curves.T, extrapolate=False)
         return spline(frequencies_mhz).T
 
     def with_component_std(self, std: tuple[float, ...] | None) -> GainModel:

@@ -25,7 +25,6 @@ from jaxtyping import Float, Int
 from lusee_bayes.core import checks, files, formats, reading
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.formats import as_dataset, read_netcdf, write_netcdf
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
 from lusee_bayes.instrument import times as at
@@ -388,7 +387,7 @@ class Visibilities(checks.Described):
             arrays |= {name: np.asarray(getattr(counts, name)) for name in names}
         said |= {"frequency_mhz": self.frequency_mhz, "jd1.scale": "utc", "jd2.scale": "utc"}
         said["window"] = None if not self.says_window else "instant" if windows is None else "mean"
-        dataset = as_dataset(formats.VISIBILITIES, LAYOUT, arrays, said)
+        dataset = formats.as_dataset(formats.VISIBILITIES, LAYOUT, arrays, said)
         dataset = dataset.assign_coords(time=("time", _datetimes(seen.times), {}, ENCODING))
         if windows is None:
             return dataset
@@ -410,7 +409,7 @@ class Visibilities(checks.Described):
         Path
         """
         with files.replacing(path) as partial:
-            write_netcdf(self.to_dataset().assign_attrs(attrs or {}), partial)
+            formats.write_netcdf(self.to_dataset().assign_attrs(attrs or {}), partial)
         return files.user_path(path)
 
 
@@ -467,7 +466,7 @@ def read_visibilities(path: str | Path) -> Visibilities:
         samples.
     """
     reading.require_file(path, "data", HINT)
-    content = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
+    content = formats.read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
     arrays, said = content.arrays, content.values
     given, expected = tuple(map(str, arrays["product"])), labels_of(len(arrays["product"]))
     if given != expected:

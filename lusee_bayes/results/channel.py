@@ -19,10 +19,9 @@ from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment import unknowns as reports
 from lusee_bayes.experiment.diagnosis import Diagnosis
-from lusee_bayes.judge import measures
+from lusee_bayes.judge import measures, residuals
 from lusee_bayes.judge.chi2 import HEADLINES, ChiSquare, Fit, Level
 from lusee_bayes.judge.coverage import Coverage
-from lusee_bayes.judge.residuals import Group
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.sky_spectrum import Departure, RegionTemperatures
 
@@ -56,14 +55,14 @@ class Judged:
     extremes: tuple[str, ...]
     suspects: tuple[str, ...]
     z: OnGrid = quantity("1", "data minus prediction from all other data, in standard deviations")
-    groups: tuple[Group, ...] = ()
+    groups: tuple[residuals.Group, ...] = ()
 
     @property
     def fit(self) -> Fit:
         """The verdict."""
         return Fit(self.level, self.verdict.removeprefix(f"{HEADLINES[self.level]} "))
 
-    def of_kind(self, kind: str) -> list[Group]:
+    def of_kind(self, kind: str) -> list[residuals.Group]:
         """Return the groups of one kind, e.g. the products."""
         return [group for group in self.groups if group.kind == kind]
 

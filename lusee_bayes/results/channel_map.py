@@ -23,14 +23,11 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import mirrored, scaled, solve_lower
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment import rounds
-from lusee_bayes.experiment.diagnosis import diagnose
+from lusee_bayes.experiment import diagnosis, rounds, validity
 from lusee_bayes.experiment.experiment import Experiment, doubts, infer, posterior_draws, rounds_of
 from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
-from lusee_bayes.experiment.validity import about_sky_above, reach
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
-from lusee_bayes.judge import measures
-from lusee_bayes.judge.coverage import N_DRAWS, Counts
+from lusee_bayes.judge import coverage, measures
 from lusee_bayes.judge.plausibility import about_information
 from lusee_bayes.judge.residuals import Residuals, residuals
 from lusee_bayes.judge.split import Split
@@ -191,7 +188,7 @@ class Conditioned:
     def drawn(self) -> Float[np.ndarray, "n modes"]:
         """All draws, in K, so that the prior's parameters are drawn only once."""
         with_truth = self.experiment.data.truth is not None
-        n = max(self.experiment.scenario.output.draws, FEW) + with_truth * N_DRAWS
+        n = max(self.experiment.scenario.output.draws, FEW) + with_truth * coverage.N_DRAWS
         return posterior_draws(self.experiment, self.posterior, lambda: self.information, n)
 
     @property
@@ -219,7 +216,7 @@ class Conditioned:
         """Draws minus the mean for :class:`.Counts`, in K; None if the truth is unknown."""
         if self.experiment.data.truth is None:
             return None
-        return self.drawn[-N_DRAWS:] - self.posterior.mean
+        return self.drawn[-coverage.N_DRAWS :] - self.posterior.mean
 
     def figures(self) -> dict[str, float | bool]:
         """Further arguments of :func:`channel_result`: numbers, and whether C is kept."""
@@ -298,7 +295,7 @@ class Conditioned:
         bad = left is not None and left.level() == "does not fit"
         if bad or thorough:
             with stages("usual mistakes"):
-                named = found["diagnosis"] = diagnose(experiment.setup, inference, left)
+                named = found["diagnosis"] = diagnosis.diagnose(experiment.setup, inference, left)
                 # no mistake: a prior above lmax that is wrong blames no data
                 blameless = bad and (not named.proposals or named.is_truncation)
                 if blameless and (other := self._under_any_sky_above(left, unused)):
@@ -310,9 +307,9 @@ class Conditioned:
         if scenario.noise.pointing is not None or bad:
             with stages("clock and pointing"):
                 found["pointing"] = pointing_report(experiment, inference)
-        notes = [] if left is None else about_sky_above(experiment.setup)
+        notes = [] if left is None else validity.about_sky_above(experiment.setup)
         with stages("first order"):
-            not_gaussian, harmless = reach(experiment, inference, alone)
+            not_gaussian, harmless = validity.reach(experiment, inference, alone)
         fitting = experiment.fitting
         altitude = experiment.highest_altitude
         if not joint:
@@ -427,7 +424,7 @@ def channel_result(
     if width is None:
         width = pixel_std(covariance, round(np.sqrt(data.highest_altitude.size / 12)))
     if compared is not None and data.truth is not None:
-        held = Counts.of_pixels(width, data.truth - mean, np.asarray(compared)).coverage()
+        held = coverage.Counts.of_pixels(width, data.truth - mean, np.asarray(compared)).coverage()
     power = data.prior_std**2
     share = np.divide(variance, power, out=np.zeros(len(variance)), where=power > 0)
     report, theta, roots, fluxes = None, None, {}, None

@@ -17,11 +17,10 @@ import pandas as pd
 from astropy.table import Table
 from jaxtyping import Float
 
+from lusee_bayes.core import harmonics, progress
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import Described, counted, extent, with_error
-from lusee_bayes.core.harmonics import synthesis_matrix
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import flux_lines
@@ -322,7 +321,7 @@ class MapResult(Described):
         """Brightness, its standard deviation and, if known, its truth in some directions."""
         nside, truth = self.scenario.map_nside, self.stacked("truth")
         pixels = healpy.ang2pix(nside, *np.transpose([*LANDMARKS.values()]), lonlat=True)
-        y = synthesis_matrix(*healpy.pix2ang(nside, pixels), self.scenario.lmax).T
+        y = harmonics.synthesis_matrix(*healpy.pix2ang(nside, pixels), self.scenario.lmax).T
         values = {"mean": self.stacked("mean") @ y, "std": self.stacked("pixel_std")[:, pixels]}
         if truth is not None:
             values["truth"] = truth @ y
@@ -359,7 +358,7 @@ class MapResult(Described):
             pulls=[] if self.single else self.pulls(),
             unknowns=self.unknowns(),
             channels=list(self.channels),
-            **about_run(self.seconds),
+            **progress.about_run(self.seconds),
         )
 
     def _joint_summary(self) -> JointSummary | None:

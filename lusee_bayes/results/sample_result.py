@@ -13,8 +13,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lusee_bayes.core.arrays import Pixels
-from lusee_bayes.core.progress import about_run
+from lusee_bayes.core import arrays, progress
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.judge.convergence import warnings_of
@@ -80,7 +79,7 @@ class SampleResult:
         return mode.pixel_statistics(self.skies, self.experiment.scenario.map_nside)
 
     @cached_property
-    def highest_altitude(self) -> Pixels:
+    def highest_altitude(self) -> arrays.Pixels:
         """sin of the highest altitude of every pixel."""
         return self.experiment.highest_altitude
 
@@ -118,7 +117,7 @@ class SampleResult:
             step_size=[float(x) for x in stats["step_size"].values[:, -1]],
             mean_steps=float(stats["n_steps"].mean()),
             steps_per_second=self.steps_per_second,
-            **about_run(self.seconds),
+            **progress.about_run(self.seconds),
         )
 
 

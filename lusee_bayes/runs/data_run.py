@@ -32,8 +32,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
 from lusee_bayes.runs import cost, plan_run
 from lusee_bayes.runs.folder import RunKind, inputs_of, run_folder
-from lusee_bayes.systematics.context import Setup
-from lusee_bayes.systematics.gain_drifts import drift_within
+from lusee_bayes.systematics import context, gain_drifts
 
 
 def run_simulate(
@@ -93,7 +92,7 @@ def run_simulate(
 
 
 def _write_waterfall(
-    path: Path, data: Sequence[Visibilities], setups: Sequence[Setup], scenario: Scenario
+    path: Path, data: Sequence[Visibilities], setups: Sequence[context.Setup], scenario: Scenario
 ) -> None:
     """Write luseepy's four-port layout if the beams have circuits, else its scalar layout."""
     sources = [(setup.beam_source, setup.frequency_mhz) for setup in setups]
@@ -396,7 +395,7 @@ def run_average(
         with naming(names_of_data(data)[0]):
             coarse = averaged(fine, to_s)
     require_fitting(fine, scenario)
-    if said := drift_within(scenario.noise.gain, coarse.observation):
+    if said := gain_drifts.drift_within(scenario.noise.gain, coarse.observation):
         raise InputError(said)
     if information:
         cost.require_resources(scenario, fine, stages)

@@ -40,9 +40,8 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from lusee_bayes.core import harmonics, reading
+from lusee_bayes.core import harmonics, lazy, reading
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.lazy import special
 from lusee_bayes.core.section import Section, Treatment
 from lusee_bayes.instrument.beams import fields as beam_fields
 from lusee_bayes.instrument.coupling import CouplingMatrix
@@ -151,7 +150,7 @@ def linear_modes(fields: beam_fields.AntennaFields, lmax: int) -> tuple[Modes, M
         the antennas, in the unit of the fields squared. Zero for ell < 2.
     """
     grid, (ell, m) = fields.grid, harmonics.mode_numbers(lmax)
-    table = special.sph_legendre_p_all(lmax, lmax, grid.theta, diff_n=1)
+    table = lazy.special.sph_legendre_p_all(lmax, lmax, grid.theta, diff_n=1)
     polar, slope = np.swapaxes(table[:, ell, np.abs(m)], 1, 2)
     sin, cot = np.sin(grid.theta)[:, None], 1.0 / np.tan(grid.theta)[:, None]
     product = ell * (ell + 1.0)

@@ -26,12 +26,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core import lazy, reading
 from lusee_bayes.core.arrays import Array, Values, namespace
 from lusee_bayes.core.checks import Described, is_traced, listed
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Layout, Variable
-from lusee_bayes.core.lazy import interpolate
-from lusee_bayes.core.reading import read_table
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, Interpolation, Pairs, ProductBeams
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.beams.source import BeamSource, Circuit, Lines, Parameter, Receiver
@@ -187,7 +186,7 @@ def weights_along(nodes: Nodes, value: float | Float[Array, ""]) -> Float[Array,
     """
     n, xp = len(nodes), namespace(value)
     degree = n - 1 if n <= MOST_IN_ONE else 3
-    spline = interpolate.make_interp_spline(nodes, np.eye(n), k=degree)
+    spline = lazy.interpolate.make_interp_spline(nodes, np.eye(n), k=degree)
     starts = np.unique(spline.t)[:-1]
     # Taylor coefficients of every weight, at the start of every piece
     taylor = np.stack([spline(starts, nu=d) / factorial(d) for d in range(degree + 1)], axis=1)
@@ -239,7 +238,7 @@ def read_grid_table(path: str | Path) -> tuple[tuple[str, ...], dict[str, Nodes]
     InputError
         If the table is missing or damaged, lacks a combination of values, or has one twice.
     """
-    columns = read_table(path, Layout(WHAT, {"file": Variable(("row",), "text")}))
+    columns = reading.read_table(path, Layout(WHAT, {"file": Variable(("row",), "text")}))
     names = [name for name in columns if name != "file"]
     layout = Layout(WHAT, dict.fromkeys(names, Variable(("row",))))
     numbers = layout.checked(path, {name: columns[name] for name in names}, {}).arrays

@@ -13,8 +13,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from lusee_bayes.core import harmonics, reading
-from lusee_bayes.core.arrays import Modes
+from lusee_bayes.core import arrays, harmonics, reading
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.measures import ell_cross
@@ -93,7 +92,7 @@ def spectra(result: MapResult) -> Figure | Panels:
     return sky_spectra(result.channel) if result.single else channel_spectra(result)
 
 
-def plot_map(sky: MapResult | Posterior | Modes, nside: int = 64) -> Figure:
+def plot_map(sky: MapResult | Posterior | arrays.Modes, nside: int = 64) -> Figure:
     """Draw a sky, or mean and standard deviation of a posterior.
 
     Parameters
