@@ -220,9 +220,8 @@ class Layout:
             _require_form(f"{path}: {name}", arrays[name], declared, sizes)
         n_bytes = sum(8 * int(np.prod(arrays[n].shape, dtype=object)) for n in present)
         if n_bytes > memory_limit():
-            raise InputError(
-                f"{path} declares {gigabytes(n_bytes)}; the memory is {gigabytes(memory_limit())}"
-            )
+            why = f"{path} declares {gigabytes(n_bytes)}; the memory is {gigabytes(memory_limit())}"
+            raise InputError(why)
         read = {}
         for name, declared in present.items():
             factor = factor_to(f"{path}: {name}", declared.unit, values.get(f"{name}.units"))

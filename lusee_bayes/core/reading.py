@@ -99,9 +99,8 @@ def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
     except (InputError, MemoryError):
         raise
     except Exception as error:
-        raise InputError(
-            f"{path} cannot be read as {what}: {_reason(error)}; it is damaged or of another kind"
-        ) from error
+        why = f"{path} cannot be read as {what}: {_reason(error)}; it is damaged or of another kind"
+        raise InputError(why) from error
 
 
 @contextmanager

@@ -261,9 +261,8 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     section, frequency = scenario.beam, scenario.frequency_mhz
     source = section.source().behind(waterfall.receiver)
     if (circuit := source.circuit(frequency)) is None:
-        raise InputError(
-            f"{waterfall.path} is in V^2/Hz, at receivers' inputs; give the response as beam.file"
-        )
+        why = f"{waterfall.path} is in V^2/Hz, at receivers' inputs; give the response as beam.file"
+        raise InputError(why)
     rule, said = source.interpolated(frequency), waterfall.interpolation
     if rule is not None and said is not None and said != INTERPOLATIONS[rule]:
         remedies = {w: f"use --set beam.interpolation={name}" for name, w in INTERPOLATIONS.items()}
@@ -388,9 +387,8 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
     said = None if scenario.flight is None else scenario.flight.per_kelvin_v2_hz
     source = scenario.beam.source()
     if source.n_ports != PORTS:
-        raise InputError(
-            f"sessions have products of {PORTS} ports, the beams {source.n_ports}; give all beams"
-        )
+        why = f"sessions have products of {PORTS} ports, the beams {source.n_ports}; give all beams"
+        raise InputError(why)
     circuit = source.circuit(scenario.frequency_mhz)
     if circuit is None and said is None:
         raise InputError(
@@ -399,9 +397,8 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
             "(beam.model=response), or the power of 1 K: --set flight.per_kelvin_v2_hz=..."
         )
     if circuit is not None and said is not None:
-        raise InputError(
-            "flight.per_kelvin_v2_hz is for beams without impedances, which these have; remove it"
-        )
+        why = "flight.per_kelvin_v2_hz is for beams without impedances, which these have; remove it"
+        raise InputError(why)
     if circuit is None:
         return np.full(source.n_ports, float(said))
     return np.ascontiguousarray(circuit.per_kelvin.diagonal().real)

@@ -220,9 +220,8 @@ def simulate_flight(scenario: Scenario, stages: progress.Stages | None = None) -
     section = flight.simulated or FlightSimulatedSection()
     radiometer, step_s = scenario.noise.radiometer, scenario.observation.step_s
     if radiometer.duty_cycle != 1.0 or radiometer.log_factor_std is not None:
-        raise InputError(
-            "noise follows from frames; remove duty_cycle and log_factor_std of noise.radiometer"
-        )
+        why = "noise follows from frames; remove duty_cycle and log_factor_std of noise.radiometer"
+        raise InputError(why)
     if flight.filter_taps:
         wrong = "channels of simulated spectra have independent noise; set flight.filter_taps to 0"
         raise InputError(wrong)
@@ -327,7 +326,6 @@ def _drawn_gains(scenario: Scenario, flight: FlightSection) -> tuple[GainModel, 
             "it and give flight.gain_std, the error of the gains of each level of each port"
         )
     if flight.gain_std is None and table.component_std is None:
-        raise InputError(
-            "noise.gain_table needs errors of the gains: flight.gain_std or flight.component_std"
-        )
+        why = "noise.gain_table needs errors of the gains: flight.gain_std or flight.component_std"
+        raise InputError(why)
     return table, *draw_gains(table, flight.gain_std, np.random.default_rng([scenario.seed, 3]))

@@ -138,9 +138,8 @@ class SurveySection(Section):
                 checks.require_shape(f"{self.mask_file}: the mask", mask.pixels, gaps.shape)
                 gaps = gaps | mask.unseen | (mask.pixels == 0.0)
             if gaps.all() or not sky.pixels[~gaps].mean() > 0.0:
-                raise InputError(
-                    f"{self.file}: the pixels' mean must be positive, and not all of them masked"
-                )
+                why = f"{self.file}: the pixels' mean must be positive, and not all of them masked"
+                raise InputError(why)
             if gaps.any():
                 template = sky_source.galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
                 filled = harmonics.modes_to_map(beam * template, healpy.npix2nside(gaps.size))

@@ -125,9 +125,8 @@ class GainModel(Described):
         if std is None:
             return self
         if self.component_std is not None:
-            raise InputError(
-                f"{self.path} contains the errors of its components; remove flight.component_std"
-            )
+            why = f"{self.path} contains the errors of its components; remove flight.component_std"
+            raise InputError(why)
         return replace(self, component_std=np.broadcast_to(std, self.components.shape[:3]).copy())
 
     def strengths(self, level: str, port: int, telemetry: Telemetry) -> Strengths:

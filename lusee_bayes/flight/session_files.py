@@ -74,9 +74,8 @@ def _version_of(path: Path, version: Any) -> int:
             "with luseepy, which writes layout 3 or newer"
         )
     if number > NEWEST:
-        raise InputError(
-            f"{path} is of layout {number}; this version reads 3 and {NEWEST}; update lusee_bayes"
-        )
+        why = f"{path} is of layout {number}; this version reads 3 and {NEWEST}; update lusee_bayes"
+        raise InputError(why)
     return number
 
 

@@ -244,9 +244,8 @@ class Observation(checks.Described):
         keep = dark | ~night_only[cut_of]
         for k, cut in enumerate(cuts):
             if not keep[cut_of == k].any():
-                raise InputError(
-                    f"{cut.name} contains no lunar night; lengthen it, move it or drop night_only"
-                )
+                why = f"{cut.name} contains no lunar night; lengthen it, move it or drop night_only"
+                raise InputError(why)
         return observation.select(keep)
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Observation:

@@ -164,9 +164,8 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     ports_and_parts = _columns(products, np.iscomplexobj(data), n_antennas)
     if data.shape[1] != len(ports_and_parts):
         turned = "; transpose them" if data.shape[0] == len(ports_and_parts) else ""
-        raise InputError(
-            f"the data have shape {data.shape}, expected (times, {len(ports_and_parts)}){turned}"
-        )
+        why = f"the data have shape {data.shape}, expected (times, {len(ports_and_parts)}){turned}"
+        raise InputError(why)
     absent = np.isnan(data) | masked | _flags(flags, data.shape)
     if np.isinf(data[~absent]).any():
         first = np.argwhere(np.isinf(data) & ~absent)[0]

@@ -144,9 +144,8 @@ def cut_runs(runs: Sequence[Run], step_s: float) -> list[Cut]:
         require_positive(f"the length in cycles of run {number}", run.cycles)
         length = run.cycles * CYCLE_DAYS * 86400.0
         if (n := int(length // step_s)) < 1:
-            raise InputError(
-                f"run {number} of {run.cycles} cycles has no sample of {step_s} s; shorten step_s"
-            )
+            why = f"run {number} of {run.cycles} cycles has no sample of {step_s} s; shorten step_s"
+            raise InputError(why)
         steps = np.full(n, float(step_s))
         samples = np.stack([elapsed + step_s * np.arange(n), steps, steps])
         cuts.append(Cut(samples, run, f"run {number}"))
@@ -277,13 +276,11 @@ def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
     entries = [_command(f"{path}, entry {name}", entry) for name, entry in root.items()]
     for (_, before, _), (place, after, _) in pairwise(entries):
         if not after > before:
-            raise InputError(
-                f"{place}: start {after} is not later than the previous one, {before}; sort them"
-            )
+            why = f"{place}: start {after} is not later than the previous one, {before}; sort them"
+            raise InputError(why)
     if entries and entries[-1][2] == OBSERVING:
-        raise InputError(
-            f"{entries[-1][0]}: the last entry, {OBSERVING}, has no end; add one of another mode"
-        )
+        why = f"{entries[-1][0]}: the last entry, {OBSERVING}, has no end; add one of another mode"
+        raise InputError(why)
     return tuple(
         Interval(_date(start), _date(end), where=place)
         for (place, start, mode), (_, end, _) in pairwise(entries)

@@ -251,9 +251,8 @@ def read_scalar(path: Path) -> Waterfall:
         pair, sign = f"{min(i, j)}{max(i, j)}", 1.0 if i < j else -1.0
         columns += [(f"{pair}R", 1.0)] if i == j else [(f"{pair}R", 1.0), (f"{pair}I", sign)]
     if data.shape[1] != len(columns):
-        raise InputError(
-            f"{path}: data has {data.shape[1]} products, expected {len(columns)} by combinations"
-        )
+        why = f"{path}: data has {data.shape[1]} products, expected {len(columns)} by combinations"
+        raise InputError(why)
     with reading.naming(path):
         said, values = content.values, np.moveaxis(data, 1, 0)
         signed = zip(columns, values, strict=True)
@@ -388,9 +387,8 @@ def write_waterfall(
     """
     path, first = files.user_path(path), channels[0].observation
     if len(channels) < 2:
-        raise InputError(
-            f"{path}: luseepy's reader needs at least two channels; give --frequencies, or {HINT}"
-        )
+        why = f"{path}: luseepy's reader needs at least two channels; give --frequencies, or {HINT}"
+        raise InputError(why)
     data, seconds = _kelvin(path, channels), times.seconds_from(first.times[0], first.times)
     if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > times.ROUNDING_S:
         wrong = f"{path}: luseepy's waterfalls need samples every {first.step_s:g} s; {HINT}"

@@ -130,9 +130,8 @@ def widened(
     precision[np.diag_indices(len(precision))] += 1.0
     root = cholesky(precision, overwrite=True)
     if not np.isfinite(np.diagonal(root)).all():
-        raise InputError(
-            "data are too precise for normal equations to tell noise from sky; use fewer at once"
-        )
+        why = "data are too precise for normal equations to tell noise from sky; use fewer at once"
+        raise InputError(why)
     half = solve_lower(root, inside[:, None], transpose=False)
     step = (factor**2 - 1.0) * solve_lower(root, half, transpose=True)[:, 0]
     less = (1.0 - factor**-2) * float(inside @ (inside + step))

@@ -84,9 +84,8 @@ class LinearGaussian(Described, eqx.Module):
                 "build both for the same observation and flags"
             )
         if self.prior.size != n_unknowns:
-            raise InputError(
-                f"A has {n_unknowns} columns, the prior {self.prior.size} unknowns; use one lmax"
-            )
+            why = f"A has {n_unknowns} columns, the prior {self.prior.size} unknowns; use one lmax"
+            raise InputError(why)
         if self.offset is not None:
             require_array("the offset", self.offset, (n_data,))
 

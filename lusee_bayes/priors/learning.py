@@ -485,6 +485,5 @@ def _under_drawn_parameters(
             return information.posterior(family.prior(family.at(parameters).covariance))
         except InputError as error:
             failed = error
-    raise InputError(
-        f"cannot draw skies with uncertain prior parameters: {failed}; use prior.model=isotropic"
-    )
+    why = f"cannot draw skies with uncertain prior parameters: {failed}; use prior.model=isotropic"
+    raise InputError(why)

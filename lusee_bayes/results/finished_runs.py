@@ -286,9 +286,8 @@ def read_information(path: Path, channel: Scenario) -> SavedInformation:
     ends = channel.lmax, channel.lmax if above is None else above.top(channel.lmax)
     if saved.information.n_modes not in map(harmonics.n_modes, ends):
         lmax = round(np.sqrt(saved.information.n_modes)) - 1
-        raise InputError(
-            f"{path} has lmax = {lmax}, the scenario lmax = {channel.lmax}; use --set lmax={lmax}"
-        )
+        why = f"{path} has lmax = {lmax}, the scenario lmax = {channel.lmax}; use --set lmax={lmax}"
+        raise InputError(why)
     return saved
 
 

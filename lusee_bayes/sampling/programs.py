@@ -330,9 +330,8 @@ def require_sampleable(
         wrong = f"{who} draws no data if data=None; sample('data', ..., obs=data) in both cases"
         raise InputError(wrong)
     if differing := {*drawn} ^ {*latent, DATA}:
-        raise InputError(
-            f"{who} samples '{min(differing)}' only with data, or only without; sample it in both"
-        )
+        why = f"{who} samples '{min(differing)}' only with data, or only without; sample it in both"
+        raise InputError(why)
 
     def slope(arguments):
         trace = handlers.trace(handlers.seed(program.model, 0)).get_trace(**arguments)

@@ -164,9 +164,8 @@ class DensePrior(Prior):
         root = np.asarray(self.root)
         above = any(row[k + 1 :].any() for k, row in enumerate(root))
         if above or not (np.diagonal(root) > 0).all():
-            raise InputError(
-                "the root of the prior must be a Cholesky factor: lower triangular, diagonal > 0"
-            )
+            why = "the root of the prior must be a Cholesky factor: lower triangular, diagonal > 0"
+            raise InputError(why)
 
     @classmethod
     def of_root(
@@ -329,9 +328,8 @@ class HarmonicPrior(DiagonalPrior):
             return
         if (negative := np.asarray(self.spectrum) < 0).any():
             ell = int(np.argmax(negative))
-            raise InputError(
-                f"C_ell of the prior is {float(self.spectrum[ell]):.3g} at ell = {ell}: negative"
-            )
+            why = f"C_ell of the prior is {float(self.spectrum[ell]):.3g} at ell = {ell}: negative"
+            raise InputError(why)
         if self.mean is None:
             return
         fixed = np.flatnonzero((np.asarray(self.mean) != 0.0) & ~(np.asarray(self.variance()) > 0))

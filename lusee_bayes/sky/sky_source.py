@@ -606,9 +606,8 @@ def read_sky_file(path: str | Path, dataset: str | None = None) -> SkyFile:
     for reader in SKY_READERS:
         if reader.recognises(path):
             return reader.read(path, dataset)
-    raise InputError(
-        f"{path} is neither HDF5, FITS nor .npz; give an ULSA file, a HEALPix map or coefficients"
-    )
+    why = f"{path} is neither HDF5, FITS nor .npz; give an ULSA file, a HEALPix map or coefficients"
+    raise InputError(why)
 
 
 def galaxy_sky(

@@ -317,7 +317,6 @@ def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:
     try:
         measured = without_gaps(data.layout.scatter(data.data), data.layout)
     except InputError as error:
-        raise InputError(
-            f"{error}, or use noise.radiometer.temperature and noise.gain.visibilities: posterior"
-        ) from error
+        why = f"{error}, or use noise.radiometer.temperature and noise.gain.visibilities: posterior"
+        raise InputError(why) from error
     return np.where(data.layout.present.any(0)[None], measured, setup.signal)

@@ -99,9 +99,8 @@ class GainTable(Systematic):
                         f"{LARGEST:g} are not modelled; give a smaller noise.gain_table.std"
                     )
             if std is None:
-                raise InputError(
-                    "the data contain no gain table; give noise.gain_table.std, a relative error"
-                )
+                why = "the data contain no gain table; give noise.gain_table.std, a relative error"
+                raise InputError(why)
             n_ports = setup.beam_source.n_ports
             slope = np.full((n_ports, setup.layout.n_times), std)
             names = tuple(f"gain_{port}" for port in range(n_ports))
