@@ -151,13 +151,11 @@ AROUND = ((-3, -1.0 / 16.0), (-1, 9.0 / 16.0), (1, 9.0 / 16.0), (3, -1.0 / 16.0)
 COMB_LIMIT = 8.0
 # a line affects its channel and those beside it; half-way between two, it affects four
 BESIDE_MHZ = 1.5 * CHANNEL_MHZ + 1e-9
-TABLE = Layout(
-    "known lines",
-    {
-        "frequency_mhz": Variable(("line",), low=0.0, high=60.0),
-        "source": Variable(("line",), "text"),
-    },
-)
+LINE_COLUMNS = {
+    "frequency_mhz": Variable(("line",), low=0.0, high=60.0),
+    "source": Variable(("line",), "text"),
+}
+TABLE = Layout("known lines", LINE_COLUMNS)
 
 
 def read_lines(path: str | Path) -> tuple[float, ...]:

@@ -38,15 +38,13 @@ UNUSED = {
 }
 # ticks of the telemetry's clock in a second
 TICKS = 65536
-TELEMETRY_4 = Layout(
-    "telemetry as the current luseepy ingests it",
-    {
-        "field_names": Variable(("field",), "text"),
-        **dict.fromkeys(("mission_seconds", "lusee_subsecs"), Variable(("time",))),
-        "values": Variable(("time", "field"), missing=True),
-        "valid": Variable(("time", "field"), "boolean", optional=True),
-    },
-)
+TELEMETRY_ARRAYS = {
+    "field_names": Variable(("field",), "text"),
+    **dict.fromkeys(("mission_seconds", "lusee_subsecs"), Variable(("time",))),
+    "values": Variable(("time", "field"), missing=True),
+    "valid": Variable(("time", "field"), "boolean", optional=True),
+}
+TELEMETRY_4 = Layout("telemetry as the current luseepy ingests it", TELEMETRY_ARRAYS)
 
 
 def session_of_4(path: Path, file: h5py.File) -> Session:

@@ -413,39 +413,37 @@ class Visibilities(checks.Described):
         return files.user_path(path)
 
 
-LAYOUT = Layout(
-    "visibilities",
-    {
-        "product": Variable(("product",), "text"),
-        "visibility": Variable(("product", "time"), finite=False, unit="K"),
-        "flag": Variable(("product", "time"), "boolean"),
-        **{name: Variable(("time",), unit="d") for name in ("jd1", "jd2")},
-        "run": Variable(("time",), "integer", low=0.0),
-        "turntable_deg": Variable(("run_number",), unit="deg"),
-        "time": Variable(("time",), "time", optional=True),
-        "time_bounds": Variable(("time", 2), "time", optional=True),
-        "live_time": Variable(("time",), optional=True, unit="s"),
-        "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
-        **{name: Variable(("piece",), optional=True, unit="s") for name in PIECES[1:]},
-        "truth": Variable(("mode",), optional=True, unit="K"),
-        # the receivers' loads ZL, if known
-        "load_frequency_mhz": Variable(LOAD[:1], low=0.0, grows=True, optional=True, unit="MHz"),
-        **dict.fromkeys(LOADS, Variable(LOAD, optional=True, unit="Ohm")),
-        "n_averaged": Variable(("time",), low=0.0, optional=True),
-        "gain_names": Variable(("gain_error",), "text", optional=True),
-        "gain_port": Variable(("gain_error",), "integer", low=0.0, optional=True),
-        "gain_slope": Variable(("gain_error", "time"), optional=True),
-    },
-    {
-        "frequency_mhz": Attribute(low=0.0, unit="MHz"),
-        "lon_deg": Attribute(low=-360.0, high=360.0),
-        "lat_deg": Attribute(low=-90.0, high=90.0),
-        "step_s": Attribute(low=0.0),
-        **JD_SCALES,
-        "window": Attribute("text", choices=("mean", "instant"), optional=True),
-        "lost": Attribute(low=0.0, high=1.0, optional=True),
-    },
-)
+ARRAYS = {
+    "product": Variable(("product",), "text"),
+    "visibility": Variable(("product", "time"), finite=False, unit="K"),
+    "flag": Variable(("product", "time"), "boolean"),
+    **{name: Variable(("time",), unit="d") for name in ("jd1", "jd2")},
+    "run": Variable(("time",), "integer", low=0.0),
+    "turntable_deg": Variable(("run_number",), unit="deg"),
+    "time": Variable(("time",), "time", optional=True),
+    "time_bounds": Variable(("time", 2), "time", optional=True),
+    "live_time": Variable(("time",), optional=True, unit="s"),
+    "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
+    **{name: Variable(("piece",), optional=True, unit="s") for name in PIECES[1:]},
+    "truth": Variable(("mode",), optional=True, unit="K"),
+    # the receivers' loads ZL, if known
+    "load_frequency_mhz": Variable(LOAD[:1], low=0.0, grows=True, optional=True, unit="MHz"),
+    **dict.fromkeys(LOADS, Variable(LOAD, optional=True, unit="Ohm")),
+    "n_averaged": Variable(("time",), low=0.0, optional=True),
+    "gain_names": Variable(("gain_error",), "text", optional=True),
+    "gain_port": Variable(("gain_error",), "integer", low=0.0, optional=True),
+    "gain_slope": Variable(("gain_error", "time"), optional=True),
+}
+NUMBERS = {
+    "frequency_mhz": Attribute(low=0.0, unit="MHz"),
+    "lon_deg": Attribute(low=-360.0, high=360.0),
+    "lat_deg": Attribute(low=-90.0, high=90.0),
+    "step_s": Attribute(low=0.0),
+    **JD_SCALES,
+    "window": Attribute("text", choices=("mean", "instant"), optional=True),
+    "lost": Attribute(low=0.0, high=1.0, optional=True),
+}
+LAYOUT = Layout("visibilities", ARRAYS, NUMBERS)
 
 
 def read_visibilities(path: str | Path) -> Visibilities:

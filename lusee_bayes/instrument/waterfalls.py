@@ -215,16 +215,14 @@ def _sun_height(jd: Float[np.ndarray, " times"]) -> Float[np.ndarray, " times"]:
 
 
 UTC_ONLY = Attribute("text", choices=("UTC",), optional=True)
-SCALAR_WATERFALL = Layout(
-    "a waterfall of luseepy's simulator",
-    {
-        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
-        # NaN where a sample is missing
-        "data": Variable(("time", "product", "freq"), finite=False, unit="K"),
-        "combinations": Variable(("pair", 2), "integer", low=0.0, high=products.N_ANTENNAS - 1.0),
-    },
-    {"LUNAR_DAY": Attribute("word"), **SITE_AND_STEP, "TIMESYS": UTC_ONLY},
-)
+SCALAR_IMAGES = {
+    "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+    # NaN where a sample is missing
+    "data": Variable(("time", "product", "freq"), finite=False, unit="K"),
+    "combinations": Variable(("pair", 2), "integer", low=0.0, high=products.N_ANTENNAS - 1.0),
+}
+SCALAR_WORDS = {"LUNAR_DAY": Attribute("word"), **SITE_AND_STEP, "TIMESYS": UTC_ONLY}
+SCALAR_WATERFALL = Layout("a waterfall of luseepy's simulator", SCALAR_IMAGES, SCALAR_WORDS)
 
 
 def read_scalar(path: Path) -> Waterfall:
@@ -271,26 +269,24 @@ def _observation(at: Time, said: Mapping[str, Any]) -> Observation:
 UNIT = "V^2/Hz"
 # FREQINT's names of the interpolation of responses between their frequencies
 INTERPOLATIONS: dict[Interpolation, str] = {"linear": "linear-native-alm", "spline": "cubic-spline"}
-FOUR_PORT_WATERFALL = Layout(
-    "a waterfall of luseepy's four-port simulator",
-    {
-        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
-        "time": Variable(("time", 2), unit="d"),
-        "products.label": Variable(("product",), "text"),
-        # NaN where a sample is missing
-        "data": Variable(("time", "product", "freq"), finite=False, unit=UNIT),
-        "blackbody_normalization_real": Variable(source.BY_PORTS),
-        **dict.fromkeys(source.LOADS, Variable(source.BY_PORTS, optional=True, unit="Ohm")),
-    },
-    {
-        **SITE_AND_STEP,
-        "TMOON_K": Attribute(low=0.0),
-        "TANT_K": Attribute(low=0.0, optional=True),
-        **dict.fromkeys(("TIMESYS", "FREQINT"), Attribute("text", optional=True)),
-        "TIMEUNIT": Attribute("text", choices=("d",), optional=True),
-        "BUNIT": Attribute("text", choices=(UNIT,)),
-    },
-)
+IMAGES = {
+    "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+    "time": Variable(("time", 2), unit="d"),
+    "products.label": Variable(("product",), "text"),
+    # NaN where a sample is missing
+    "data": Variable(("time", "product", "freq"), finite=False, unit=UNIT),
+    "blackbody_normalization_real": Variable(source.BY_PORTS),
+    **dict.fromkeys(source.LOADS, Variable(source.BY_PORTS, optional=True, unit="Ohm")),
+}
+WORDS = {
+    **SITE_AND_STEP,
+    "TMOON_K": Attribute(low=0.0),
+    "TANT_K": Attribute(low=0.0, optional=True),
+    **dict.fromkeys(("TIMESYS", "FREQINT"), Attribute("text", optional=True)),
+    "TIMEUNIT": Attribute("text", choices=("d",), optional=True),
+    "BUNIT": Attribute("text", choices=(UNIT,)),
+}
+FOUR_PORT_WATERFALL = Layout("a waterfall of luseepy's four-port simulator", IMAGES, WORDS)
 
 
 def read_four_port(path: Path) -> Waterfall:

@@ -39,13 +39,11 @@ ORDER, STEPS, FAINT = 6, 5, 1e-6
 DETECTED, LEVEL = 5.0, 0.95
 Columns = Float[np.ndarray, "_ _"]
 TERM = "the next term of the polynomial"
-TABLE = Layout(
-    "a template of a signal",
-    {
-        "frequency_mhz": Variable(("frequency",), grows=True),
-        "temperature_k": Variable(("frequency",)),
-    },
-)
+TEMPLATE_COLUMNS = {
+    "frequency_mhz": Variable(("frequency",), grows=True),
+    "temperature_k": Variable(("frequency",)),
+}
+TABLE = Layout("a template of a signal", TEMPLATE_COLUMNS)
 
 
 @dataclass(frozen=True)

@@ -433,11 +433,9 @@ PUBLISHED: dict[str, tuple[Callable, tuple[float, float]]] = {
     "RAE 2: Novaco and Brown 1978": (novaco_brown_1978, (0.25, 9.2)),
 }
 # the table of a spectrum that others measured
-MEASURED = Layout(
-    "a spectrum",
-    {
-        "frequency_mhz": Variable(("frequency",), low=0.0),
-        "temperature_k": Variable(("frequency",)),
-        "std_k": Variable(("frequency",), low=0.0, optional=True),
-    },
-)
+MEASURED_COLUMNS = {
+    "frequency_mhz": Variable(("frequency",), low=0.0),
+    "temperature_k": Variable(("frequency",)),
+    "std_k": Variable(("frequency",), low=0.0, optional=True),
+}
+MEASURED = Layout("a spectrum", MEASURED_COLUMNS)

@@ -22,22 +22,20 @@ from lusee_bayes.systematics.systematic import SKY
 
 # required contents of a file of samples
 STATISTIC = ("chain", "draw")
-GROUPS = Layout(
-    "samples of lusee-bayes sample",
-    {
-        "sample_stats.diverging": Variable(STATISTIC, "boolean"),
-        "sample_stats.n_steps": Variable(STATISTIC, low=0.0),
-        "sample_stats.acceptance_rate": Variable(STATISTIC),
-        "sample_stats.energy": Variable(STATISTIC, missing=True),
-        "posterior.sky": Variable(("chain", "draw", "mode"), optional=True),
-        "observed_data.data": Variable(("datum",)),
-    },
-    {
-        "program": Attribute("text"),
-        "frequency_mhz": Attribute(low=0.0, optional=True),
-        "identity": Attribute("text", optional=True),
-    },
-)
+ARRAYS = {
+    "sample_stats.diverging": Variable(STATISTIC, "boolean"),
+    "sample_stats.n_steps": Variable(STATISTIC, low=0.0),
+    "sample_stats.acceptance_rate": Variable(STATISTIC),
+    "sample_stats.energy": Variable(STATISTIC, missing=True),
+    "posterior.sky": Variable(("chain", "draw", "mode"), optional=True),
+    "observed_data.data": Variable(("datum",)),
+}
+WORDS = {
+    "program": Attribute("text"),
+    "frequency_mhz": Attribute(low=0.0, optional=True),
+    "identity": Attribute("text", optional=True),
+}
+GROUPS = Layout("samples of lusee-bayes sample", ARRAYS, WORDS)
 
 
 def to_datatree(

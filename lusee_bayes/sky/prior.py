@@ -364,13 +364,11 @@ class HarmonicPrior(DiagonalPrior):
             raise InputError(wrong)
 
 
-SPECTRUM = layouts.Layout(
-    "text file of ell and C_ell in K^2",
-    {
-        "ell": layouts.Variable(("line",), "integer", low=0.0, grows=True),
-        "C_ell": layouts.Variable(("line",), low=0.0),
-    },
-)
+SPECTRUM_COLUMNS = {
+    "ell": layouts.Variable(("line",), "integer", low=0.0, grows=True),
+    "C_ell": layouts.Variable(("line",), low=0.0),
+}
+SPECTRUM = layouts.Layout("text file of ell and C_ell in K^2", SPECTRUM_COLUMNS)
 
 
 def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:

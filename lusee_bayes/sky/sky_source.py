@@ -288,20 +288,16 @@ def _require_ring(path: str | Path, header: Mapping[str, Any], ordering: str) ->
 
 
 COLUMNS = ("index", "real", "imag")
-TABLE = Layout(
-    "coefficients, as healpy.write_alm writes them",
-    {
-        "index": Variable(("coefficient",), "integer", low=1.0),
-        **dict.fromkeys(COLUMNS[1:], Variable(("coefficient",), unit="K")),
-    },
-)
-NPZ = Layout(
-    "coefficients: freq (MHz) and alm (frequency, coefficient)",
-    {
-        "freq": Variable(("freq",), low=0.0, unit="MHz"),
-        "alm": Variable(("freq", "coefficient"), "complex"),
-    },
-)
+TABLE_COLUMNS = {
+    "index": Variable(("coefficient",), "integer", low=1.0),
+    **dict.fromkeys(COLUMNS[1:], Variable(("coefficient",), unit="K")),
+}
+TABLE = Layout("coefficients, as healpy.write_alm writes them", TABLE_COLUMNS)
+NPZ_ARRAYS = {
+    "freq": Variable(("freq",), low=0.0, unit="MHz"),
+    "alm": Variable(("freq", "coefficient"), "complex"),
+}
+NPZ = Layout("coefficients: freq (MHz) and alm (frequency, coefficient)", NPZ_ARRAYS)
 
 
 @dataclass(frozen=True, repr=False)

@@ -175,16 +175,14 @@ def parts_of(*names: str) -> list[str]:
     return [f"{name}_{part}" for name in names for part in ("real", "imag")]
 
 
-RESPONSE_LAYOUT = Layout(
-    "a four-port response of luseepy, FITS version 3",
-    {
-        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
-        **{name: Variable((name,), grows=True, unit="deg") for name in AXES[1:]},
-        **dict.fromkeys(parts_of(*LENGTHS), Variable((N_ANTENNAS, *AXES), unit="m")),
-        **dict.fromkeys(parts_of(*MATRICES), MATRIX),
-    },
-    dict.fromkeys((*CONVENTIONS, *SOURCES), Attribute("word", optional=True)),
-)
+IMAGES = {
+    "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+    **{name: Variable((name,), grows=True, unit="deg") for name in AXES[1:]},
+    **dict.fromkeys(parts_of(*LENGTHS), Variable((N_ANTENNAS, *AXES), unit="m")),
+    **dict.fromkeys(parts_of(*MATRICES), MATRIX),
+}
+WORDS = dict.fromkeys((*CONVENTIONS, *SOURCES), Attribute("word", optional=True))
+RESPONSE_LAYOUT = Layout("a four-port response of luseepy, FITS version 3", IMAGES, WORDS)
 # files store the matrices in single precision, and three of them are added
 RESISTANCE_TOLERANCE = 1e-6
 
@@ -397,20 +395,18 @@ FIELD_NAMES = ("Etheta", "EPhi")
 IMPEDANCE = ("Z_real", "Z_imag")
 FIELD, OHM = Variable(("freq", "theta", "phi")), Variable(("freq",), optional=True, unit="Ohm")
 ENDS = {"THETA_MIN": 0.0, "THETA_MAX": 90.0, "PHI_MIN": 0.0, "PHI_MAX": 360.0}
-SCALAR_LAYOUT = Layout(
-    "a scalar beam file of luseepy, FITS version 2",
-    {
-        **dict.fromkeys(parts_of(*FIELD_NAMES), FIELD),
-        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
-        "gain_conv": Variable(("freq",)),
-        **dict.fromkeys(IMPEDANCE, OHM),
-    },
-    {
-        **{key: Attribute("integer", low=2.0) for key in ("THETA_N", "PHI_N")},
-        **{key: Attribute(low=degrees, high=degrees) for key, degrees in ENDS.items()},
-        **dict.fromkeys(CONVENTIONS, Attribute("word", optional=True)),
-    },
-)
+SCALAR_IMAGES = {
+    **dict.fromkeys(parts_of(*FIELD_NAMES), FIELD),
+    "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+    "gain_conv": Variable(("freq",)),
+    **dict.fromkeys(IMPEDANCE, OHM),
+}
+SCALAR_WORDS = {
+    **{key: Attribute("integer", low=2.0) for key in ("THETA_N", "PHI_N")},
+    **{key: Attribute(low=degrees, high=degrees) for key, degrees in ENDS.items()},
+    **dict.fromkeys(CONVENTIONS, Attribute("word", optional=True)),
+}
+SCALAR_LAYOUT = Layout("a scalar beam file of luseepy, FITS version 2", SCALAR_IMAGES, SCALAR_WORDS)
 # luseepy turns the pattern by 90 degrees from port to port: North, West, South, East for an arm
 # that points North
 ROTATIONS_DEG = (0.0, 90.0, 180.0, 270.0)
