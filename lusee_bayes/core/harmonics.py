@@ -124,9 +124,7 @@ def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.nd
     return from_healpy(healpy.map2alm(pixels, lmax=lmax, iter=10))
 
 
-def modes_to_map(
-    modes: Float[Array, "*batch modes"], nside: int
-) -> Float[np.ndarray, "*batch pixels"]:
+def modes_to_map(modes: Fields, nside: int) -> Float[np.ndarray, "*batch pixels"]:
     """Synthesise the HEALPix RING maps of packed coefficients."""
     require_nside(nside)
     alm, lmax = to_healpy(modes), lmax_of(np.shape(modes)[-1])

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cython_blas, cython_lapack
 
-from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.arrays import Array, Square, namespace
 from lusee_bayes.core.checks import is_traced, require_float64
 from lusee_bayes.core.errors import InputError
 
@@ -94,9 +94,7 @@ def cholesky(matrix: Matrices, *, overwrite: bool = False) -> Matrices:
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
-def lower_triangle(
-    matrix: Float[np.ndarray, "n n"], *, overwrite: bool = False
-) -> Float[np.ndarray, "n n"]:
+def lower_triangle(matrix: Square, *, overwrite: bool = False) -> Square:
     """Return a matrix with zeros above the diagonal, in less than half the time of ``np.tril``."""
     lower = matrix if overwrite else matrix.copy(order="C")
     for row in range(len(lower)):

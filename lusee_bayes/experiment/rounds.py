@@ -607,8 +607,7 @@ def with_learned_prior(
             setup = _with_learned_sky_above(setup, covariance, start)
     result = settled(setup, start, learn, report)
     if surveys:
-        learned = _compared_surveys(setup, whole(result), result.learned)
-        result = replace(result, learned=learned)
+        result = replace(result, learned=_compared_surveys(setup, whole(result), result.learned))
     return replace(setup, prior=result.learned.prior), result
 
 

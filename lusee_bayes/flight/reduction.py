@@ -80,8 +80,7 @@ def reduce_sessions(
     whole = {name: np.stack([band[name] for band in bands]) for name in bands[0]}
     bend = xarray.DataArray(whole.pop("bend"), dims=("band", "port", "bin")).mean("bin")
     for name in ("scatter", "line_scatter"):
-        parts = xarray.DataArray(whole[name], dims=("band", "part"))
-        whole[name] = parts.median("part").values
+        whole[name] = xarray.DataArray(whole[name], dims=("band", "part")).median("part").values
     window, windows = {}, line.observation.windows
     if windows is not None:
         window = {"window_start_s": windows.start_s, "window_end_s": windows.end_s}

@@ -273,8 +273,7 @@ def measured_experiment(
     experiment = make(scenario, measured, stages)
     if not truth:
         return experiment
-    data = replace(experiment.data, truth=experiment.setup.sky.modes)
-    return replace(experiment, data=data)
+    return replace(experiment, data=replace(experiment.data, truth=experiment.setup.sky.modes))
 
 
 def _smaller(scenario: Scenario) -> Iterator[tuple[str, float | str, Scenario]]:

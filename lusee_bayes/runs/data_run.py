@@ -275,13 +275,9 @@ def _to_be_mapped(made: FlightSimulation, folder: Path) -> Scenario:
     }
     average_s = observation.average_s or (AVERAGE_S if observation.step_s < AVERAGE_S else None)
     times = {"timestamp": "middle", "average_s": average_s}
-    scenario = made.scenario.anchored()
-    return scenario.model_copy(
-        update={
-            "flight": flight.anchored().model_copy(update=said),
-            "observation": scenario.observation.model_copy(update=times),
-        }
-    )
+    scenario, flight = made.scenario.anchored(), flight.anchored().model_copy(update=said)
+    observation = scenario.observation.model_copy(update=times)
+    return scenario.model_copy(update={"flight": flight, "observation": observation})
 
 
 def _clock_text(clock: Clock) -> str:
