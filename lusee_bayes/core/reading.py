@@ -19,8 +19,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
-from ruamel.yaml import YAML, YAMLError
-from ruamel.yaml.constructor import SafeConstructor
+from ruamel.yaml import YAML, YAMLError, constructor
 
 from lusee_bayes.core import files, layouts
 from lusee_bayes.core.errors import InputError
@@ -219,7 +218,7 @@ def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> layouts.Unloaded:
     return layouts.Unloaded(header[0], header[2], partial(arrays.__getitem__, name))
 
 
-class _Constructor(SafeConstructor):
+class _Constructor(constructor.SafeConstructor):
     """The safe constructor, without dates."""
 
 

@@ -27,15 +27,13 @@ from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, KnownFactor, LowRankUpdate
 from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.sky.sky_source import Sky
+from lusee_bayes.systematics import noise_level, registered, sources
 from lusee_bayes.systematics import systematic as kinds
 from lusee_bayes.systematics.above_lmax import AboveLmax, sky_above
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities, prior_and_family
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.horizon import Horizon
-from lusee_bayes.systematics.noise_level import radiometer_about
-from lusee_bayes.systematics.registered import present
 from lusee_bayes.systematics.regolith import ground_per_kelvin
-from lusee_bayes.systematics.sources import source_responses
 
 # sites closer than this, 30 m, count as one
 SAME_SITE_DEG = 1e-3
@@ -81,7 +79,7 @@ def set_up(
             ground_per_kelvin(source, scenario.frequency_mhz)  # refuses beams without a ground
         if (noise := scenario.noise.receiver) is not None:
             background[auto_indices(source.n_ports)] += noise.powers(source, scenario.frequency_mhz)
-        responses = source_responses(scenario, observation, source, scenario.frequency_mhz)
+        responses = sources.source_responses(scenario, observation, source, scenario.frequency_mhz)
     if data is not None and data.layout.n_products != beams.n_products:
         raise InputError(
             f"the data have {data.layout.n_products} products, the beams supply "
@@ -127,7 +125,7 @@ def _coupling_above(setup: Setup, values: kinds.Truth) -> CouplingMatrix:
     coupling = CouplingMatrix.build(beams, Pointing.of(setup.observation, top), setup.layout)
     sky = Sky(np.zeros(harmonics.n_modes(top)), setup.frequency_mhz)
     whole = replace(setup, scenario=scenario, sky=sky, beams=beams, coupling=coupling, hidden=None)
-    for cls, section in present(scenario):
+    for cls, section in registered.present(scenario):
         whole = cls.moved(section, whole, values)
     return whole.coupling
 
@@ -165,7 +163,7 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
 def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     """Radiometer term of N in K^2, from the visibilities of :func:`.radiometer_about`."""
     section, around = setup.scenario.noise.radiometer, around or Around()
-    visibilities = noise_visibilities(setup, around, radiometer_about(setup))
+    visibilities = noise_visibilities(setup, around, noise_level.radiometer_about(setup))
     given = {"bandwidth_hz": 1.0, "step_s": setup.n_averaged, "factor": section.factor}
     if around.tempered == 1.0:
         return radiometer_noise(visibilities, setup.layout, **given, form=section.form)
@@ -185,7 +183,7 @@ def moved(setup: Setup, values: kinds.Truth | None, *, above: bool = False) -> S
         Whether A of the sky above lmax is needed for them, too.
     """
     made = setup
-    for cls, section in present(setup.scenario) if values else ():
+    for cls, section in registered.present(setup.scenario) if values else ():
         made = cls.moved(section, made, values)
     if made is setup:
         return setup
@@ -205,7 +203,7 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, k
     placed = moved(setup, around.values, above=around.tempered == 1.0)
     return [
         (treatment, cls.build(section, placed, around))
-        for cls, section in present(setup.scenario)
+        for cls, section in registered.present(setup.scenario)
         if (treatment := cls.treatment(setup.scenario)) != "ignored"
     ]
 
@@ -335,7 +333,7 @@ def model_to_sample(
 def true_values(setup: Setup) -> kinds.Truth:
     """True values of the systematics in simulated data, by the names of their sites."""
     truth: kinds.Truth = {}
-    for cls, section in present(setup.scenario):
+    for cls, section in registered.present(setup.scenario):
         truth |= cls.truth(section, setup, jax.random.key(cls.true_seed(section, setup.scenario)))
     return truth
 
@@ -344,7 +342,7 @@ def true_model(setup: Setup, truth: kinds.Truth) -> LinearGaussian:
     """The model of simulated data: true instrument, true values and radiometer noise."""
     key, true = jax.random.key(setup.scenario.seed), moved(setup, truth, above=True)
     model = LinearGaussian(true.coupling, setup.prior, radiometer(setup), true.offset)
-    for cls, section in present(setup.scenario):
+    for cls, section in registered.present(setup.scenario):
         model = cls.in_data(section, true, model, truth, key)
     return model
 

@@ -23,10 +23,9 @@ from lusee_bayes.core.errors import InputError, nearest, require_known
 from lusee_bayes.core.section import Frequency, Section, Seed
 from lusee_bayes.experiment import instrument_sections, sky_sections
 from lusee_bayes.flight.recipe import FlightSection
+from lusee_bayes.systematics import field_errors, registered
 from lusee_bayes.systematics.above_lmax import AboveLmaxSection
 from lusee_bayes.systematics.beam import BeamErrorSection
-from lusee_bayes.systematics.field_errors import FieldErrorsSection
-from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection, present
 from lusee_bayes.systematics.sources import SourcesSection
 
 
@@ -196,7 +195,7 @@ class Scenario(Section):
     beam: instrument_sections.BeamSection = instrument_sections.MonopoleBeamSection()
     sky: sky_sections.SkySection = sky_sections.GalaxySection()
     prior: sky_sections.PriorSection = sky_sections.LocalScalesPriorSection()
-    noise: NoiseSection = NoiseSection()
+    noise: registered.NoiseSection = registered.NoiseSection()
     sources: SourcesSection = SourcesSection()
     spectral: sky_sections.SpectralSection = sky_sections.SpectralSection()
     flight: FlightSection | None = None
@@ -252,7 +251,7 @@ class Scenario(Section):
             return {}
         return {
             cls.words: octaves
-            for cls, section in present(self)
+            for cls, section in registered.present(self)
             if cls.treatment(self) != "ignored" and (octaves := cls.octaves(section))
         }
 
@@ -268,7 +267,7 @@ class Scenario(Section):
         sizes = {name: error * getattr(self.beam, name) for name, error in self.beam.errors.items()}
         stds = {name: std for name, std in sizes.items() if std > 0.0}
         beam = BeamErrorSection(parameters=stds) if stds else None
-        fields = FieldErrorsSection() if self.beam.source().has_fields else None
+        fields = field_errors.FieldErrorsSection() if self.beam.source().has_fields else None
         return self.with_section("noise", beam=beam, fields=fields)
 
     def with_section(self, name: str, **values: object) -> Scenario:
@@ -295,7 +294,7 @@ class Scenario(Section):
     @property
     def samples(self) -> bool:
         """Whether anything besides the sky is sampled."""
-        return "sampled" in {cls.treatment(self) for cls in SYSTEMATICS}
+        return "sampled" in {cls.treatment(self) for cls in registered.SYSTEMATICS}
 
     def require_marginal(self, what: str, advice: str) -> None:
         """Raise InputError if anything is sampled, for commands that can only marginalise."""

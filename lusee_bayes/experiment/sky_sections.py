@@ -20,8 +20,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, kinds_of, one_of, requires
-from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
-from lusee_bayes.priors.local_scales import embedded_local_scales
+from lusee_bayes.priors import families, local_scales
 from lusee_bayes.priors.surveys import Survey
 from lusee_bayes.sky import galaxy, sky_source
 from lusee_bayes.sky.positive_skies import PositiveSkies
@@ -233,12 +232,12 @@ class IsotropicPriorSection(SpectrumSection):
         """Whether C_ell is learned from the data."""
         return self.spectrum == "learned" and self.spectrum_file is None
 
-    def family(self, frequency_mhz: float, lmax: int) -> PriorFamily | None:
+    def family(self, frequency_mhz: float, lmax: int) -> families.PriorFamily | None:
         """The family from which data select a prior, up to lmax; None if C_ell is given."""
         if not self.is_learned:
             return None
         mean = sky_source.galaxy_sky(frequency_mhz, 0, seed=None, sources=()).mean_temperature
-        return IsotropicFamily.around(mean, lmax)
+        return families.IsotropicFamily.around(mean, lmax)
 
     def prior(self, sky: sky_source.Sky) -> Prior:
         """The prior, S and mean, at the frequency and up to the lmax of a model sky."""
@@ -290,11 +289,11 @@ class LocalScalesPriorSection(Section):
     surveys: tuple[SurveySection, ...] = ()
     sources: bool = True
 
-    def family(self, frequency_mhz: float, lmax: int) -> PriorFamily:
+    def family(self, frequency_mhz: float, lmax: int) -> families.PriorFamily:
         """The family from which data select a prior, up to lmax."""
         sources = galaxy.BRIGHT_SOURCES if self.sources else ()
         surveys = [one.at(frequency_mhz, lmax) for one in self.surveys]
-        return embedded_local_scales(frequency_mhz, lmax, sources, surveys=surveys)
+        return local_scales.embedded_local_scales(frequency_mhz, lmax, sources, surveys=surveys)
 
 
 PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)

@@ -28,8 +28,7 @@ from jaxtyping import Bool, Float, Int
 from lunarsky import MCMF
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core import checks
-from lusee_bayes.core.arrays import Times
+from lusee_bayes.core import arrays, checks
 from lusee_bayes.core.errors import InputError, nearest, refusing, require_known
 from lusee_bayes.instrument import times
 from lusee_bayes.instrument.schedule import Cut, Interval, Run, cut_intervals, cut_runs
@@ -274,7 +273,7 @@ class Observation(checks.Described):
         return len(self.turntable_deg)
 
     @property
-    def live_s(self) -> Times:
+    def live_s(self) -> arrays.Times:
         """Integration time of every sample, in seconds."""
         steps = np.full(self.n_times, float(self.step_s))
         return steps if self.windows is None else self.windows.live_per_sample_s
@@ -303,7 +302,7 @@ class Observation(checks.Described):
         return replace(self, times=at, run=run, windows=None), sample, weight
 
     @cached_property
-    def hours(self) -> Times:
+    def hours(self) -> arrays.Times:
         """Hours since the first sample."""
         with times.unannounced_leap_seconds():
             tdb = self.times.tdb
@@ -376,7 +375,7 @@ class Observation(checks.Described):
         cos, sin = np.cos(turned), np.sin(turned)
         return np.stack([cos * east + sin * north, cos * north - sin * east, up], axis=1)
 
-    def sun_altitude_deg(self) -> Times:
+    def sun_altitude_deg(self) -> arrays.Times:
         """Return the geometric altitude of the Sun's centre above the horizon in degrees."""
         sun = _barycentric_km("sun", self.times) - _barycentric_km("moon", self.times)
         height = np.einsum("ti,ti->t", self.zenith_galactic(), sun)
@@ -470,7 +469,7 @@ def site_of(site: Any) -> tuple[float, float]:
     return lon, lat
 
 
-def numbers_of_times(name: str, values: Any, n_times: int) -> Times:
+def numbers_of_times(name: str, values: Any, n_times: int) -> arrays.Times:
     """Return a finite number for each time, from one per time or one for all.
 
     Raises

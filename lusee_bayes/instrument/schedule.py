@@ -25,9 +25,8 @@ import numpy as np
 from astropy.time import Time
 from jaxtyping import Float
 
-from lusee_bayes.core.checks import require_positive
+from lusee_bayes.core import checks, lazy
 from lusee_bayes.core.errors import InputError, refusing
-from lusee_bayes.core.lazy import pandas
 from lusee_bayes.core.reading import naming, parse_yaml, read_text, reading
 from lusee_bayes.instrument import times
 
@@ -136,12 +135,12 @@ def cut_runs(runs: Sequence[Run], step_s: float) -> list[Cut]:
     InputError
         For a bad step or length, for a run without samples, and if there is no run.
     """
-    require_positive("step_s", step_s)
+    checks.require_positive("step_s", step_s)
     if not runs:
         raise InputError("an observation needs at least one run, got none")
     elapsed, cuts = 0.0, []
     for number, run in enumerate(runs):
-        require_positive(f"the length in cycles of run {number}", run.cycles)
+        checks.require_positive(f"the length in cycles of run {number}", run.cycles)
         length = run.cycles * CYCLE_DAYS * 86400.0
         if (n := int(length // step_s)) < 1:
             why = f"run {number} of {run.cycles} cycles has no sample of {step_s} s; shorten step_s"
@@ -161,7 +160,7 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> list[Cut]:
     InputError
         For a bad step, and as :func:`named_in_order`.
     """
-    require_positive("step_s", step_s)
+    checks.require_positive("step_s", step_s)
     cuts = []
     for name, interval in named_in_order(intervals):
         begins = step_s * np.arange(interval.n_samples(step_s))
@@ -240,8 +239,8 @@ def _parsed(path: str, text: str) -> tuple[Interval, ...]:
 
 def _of_table(path: str, text: str) -> tuple[Interval, ...]:
     with reading(path, WHAT):
-        table = pandas.read_csv(StringIO(text), dtype=str, comment="#", skipinitialspace=True)
-        if not isinstance(table.index, pandas.RangeIndex):
+        table = lazy.pandas.read_csv(StringIO(text), dtype=str, comment="#", skipinitialspace=True)
+        if not isinstance(table.index, lazy.pandas.RangeIndex):
             raise ValueError("rows have more entries than the header")
     table = table.fillna("")
     if not REQUIRED <= set(table.columns) <= REQUIRED | OPTIONAL:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
-from matplotlib import colormaps
+from matplotlib import colormaps, colors
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from lusee_bayes.core.harmonics import lmax_of, taper_fwhm_deg
@@ -65,7 +64,7 @@ def frequency_maps(cases: Cases) -> Figure:
         percent = 100.0 * (mean - truth) / truth.mean()
         limit = float(np.percentile(np.abs(percent), 99.0))
         norm = drawing.temperatures(truth)
-        seen, signed = case["highest_altitude"].values, Normalize(-limit, limit)
+        seen, signed = case["highest_altitude"].values, colors.Normalize(-limit, limit)
         rows = [
             ("truth", truth, norm, "inferno", None),
             ("posterior mean", mean, norm, "inferno", seen),

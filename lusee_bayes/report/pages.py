@@ -12,10 +12,9 @@ from lusee_bayes.core import files, harmonics, layouts
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import read_model, read_table
 from lusee_bayes.flight.reduced import REASONS, REDUCED, Reduced, read_reduced
+from lusee_bayes.judge import convergence, left_out
 from lusee_bayes.judge.chi2 import ChiSquare, stands_out
-from lusee_bayes.judge.convergence import FAR, FEW, warnings_of
 from lusee_bayes.judge.cube_fit import N_TESTS
-from lusee_bayes.judge.left_out import KINDS
 from lusee_bayes.report.rendering import render, render_run
 from lusee_bayes.report.viewer import viewer
 from lusee_bayes.results.channel import Judged
@@ -77,7 +76,7 @@ def _groups(judged: Judged | None) -> dict[str, dict[str, Any]]:
     if judged is None:
         return shown
     marked = {*judged.suspects, *judged.extremes}
-    for kind in KINDS:
+    for kind in left_out.KINDS:
         listed = groups = judged.of_kind(kind)
         if kind == "day" and len(listed) > WORST_DAYS:
             listed = sorted(listed, key=lambda group: group.p)[:WORST_DAYS]
@@ -135,7 +134,7 @@ def sample_page(folder: Path, name: str) -> str:
     sampling = read_model(path, SamplingSummary, "the figures of a sampled run")
     quantities = read_table(folder / "summary.csv", SUMMARY_TABLE)
     worst = float(np.nanmax(quantities["r_hat"], initial=-np.inf))
-    many, counts = FEW * sampling.chains * sampling.draws, {"divergences", "chains"}
+    many, counts = convergence.FEW * sampling.chains * sampling.draws, {"divergences", "chains"}
     checks = None
     if validation.is_file():
         checks = read_model(validation, ValidationSummary, "the checks of a validation").checks
@@ -146,8 +145,8 @@ def sample_page(folder: Path, name: str) -> str:
         name=name,
         quantities=quantities,
         worst=worst if np.isfinite(worst) else None,
-        reasons=warnings_of(quantities, **sampling.model_dump(include=counts)),
-        bad=worst > FAR or sampling.divergences > many,
+        reasons=convergence.warnings_of(quantities, **sampling.model_dump(include=counts)),
+        bad=worst > convergence.FAR or sampling.divergences > many,
         checks=checks,
         failed=[not check.passed for check in checks or ()],
     )

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib import colormaps
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib import colormaps, colors
 
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.lazy import coordinates, healpy
@@ -118,9 +117,9 @@ def _quantised(cube: Maps, nside: int) -> dict[str, Any]:
     return {"nside": nside, **scale, "levels": _base64(levels)}
 
 
-def _bounds(norm: Normalize) -> dict[str, Any]:
+def _bounds(norm: colors.Normalize) -> dict[str, Any]:
     low, high = float(norm.vmin), float(norm.vmax)
-    return {"low": low, "high": high, "log": isinstance(norm, LogNorm)}
+    return {"low": low, "high": high, "log": isinstance(norm, colors.LogNorm)}
 
 
 def _regions(details: Details) -> dict[str, Any]:

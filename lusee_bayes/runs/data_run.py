@@ -17,8 +17,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import require_new, transaction, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
-from lusee_bayes.experiment.data_files import Data, names_of_data, read_data, reduce_files
-from lusee_bayes.experiment.experiment import observed
+from lusee_bayes.experiment import data_files, experiment
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
 from lusee_bayes.experiment.model import require_fitting, set_up, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
@@ -148,7 +147,7 @@ def run_reduce(
     scenario = load_scenario(scenario)
     stages, path = stages or Stages(), user_path(path)
     require_new(path, replace=replace, inputs=inputs_of(scenario, files))
-    reduced = reduce_files(files, scenario, stages)
+    reduced = data_files.reduce_files(files, scenario, stages)
     if np.isnan(reduced.before).all():
         raise InputError(
             f"nothing to reduce: all {len(reduced.bin_of)} spectra of {', '.join(map(str, files))} "
@@ -347,7 +346,7 @@ class Averages:
 
 def run_average(
     scenario: Scenario | str | Path,
-    data: Data,
+    data: data_files.Data,
     to_s: float,
     path: str | Path,
     *,
@@ -387,8 +386,8 @@ def run_average(
     scenario.require_single("averages have")
     scenario = scenario.with_section("observation", average_s=None)
     with stages("data"):
-        fine = read_data(data, scenario)
-        with naming(names_of_data(data)[0]):
+        fine = data_files.read_data(data, scenario)
+        with naming(data_files.names_of_data(data)[0]):
             coarse = averaged(fine, to_s)
     require_fitting(fine, scenario)
     if said := gain_drifts.drift_within(scenario.noise.gain, coarse.observation):
@@ -405,5 +404,5 @@ def run_average(
 
 
 def _bits(scenario: Scenario, data: Visibilities) -> float:
-    setup = observed(scenario.of_measured(), data).setup
+    setup = experiment.observed(scenario.of_measured(), data).setup
     return float(plan_run.expected_inference(setup).posterior.information_bits())

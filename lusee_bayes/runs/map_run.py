@@ -13,7 +13,6 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment import data_files
-from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import REDUCED, Reduced, write_reduced
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -30,7 +29,7 @@ def run_map(
     scenario: Scenario | str | Path,
     folder: str | Path,
     *,
-    data: Data | None = None,
+    data: data_files.Data | None = None,
     truth: bool = False,
     earlier: str | Path | None = None,
     thorough: bool = False,
@@ -94,8 +93,8 @@ def run_map(
 
 
 def _given(
-    data: Data | None, reduced: Reduced | None, scenario: Scenario, folder: Path
-) -> Data | None:
+    data: data_files.Data | None, reduced: Reduced | None, scenario: Scenario, folder: Path
+) -> data_files.Data | None:
     """The data that channels read: sessions as reduced spectra, in a file for several channels."""
     if reduced is None:
         return data
@@ -108,7 +107,7 @@ def _given(
     return write_reduced(path, reduced, scenario.to_yaml())
 
 
-def _first(data: Data, scenario: Scenario) -> Visibilities | None:
+def _first(data: data_files.Data, scenario: Scenario) -> Visibilities | None:
     """The data of the first channel that has any."""
     for channel in scenario.channels():
         with suppress(InputError):

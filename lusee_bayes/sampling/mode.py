@@ -30,8 +30,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 from numpyro import distributions as dist
-from numpyro import handlers
-from numpyro.infer import init_to_median
+from numpyro import handlers, infer
 from numpyro.infer.util import constrain_fn, potential_energy
 
 from lusee_bayes.core.arrays import Array, DataVector
@@ -286,7 +285,7 @@ def _drawn(
 
 def _trace(program: Callable, arguments: dict, start: Mapping[str, Array]) -> dict:
     """One run of the program at the start."""
-    median = init_to_median(num_samples=31)
+    median = infer.init_to_median(num_samples=31)
 
     def place(site):
         return start[site["name"]] if site["name"] in start else median(site)

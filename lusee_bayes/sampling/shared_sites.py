@@ -24,8 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 from numpyro import distributions as dist
-from numpyro.infer import Predictive
-from numpyro.primitives import Messenger
+from numpyro import infer, primitives
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.linear.amplitudes import Amplitudes, kernel, tie
@@ -145,11 +144,11 @@ class SharedSites:
             numpyro.deterministic("skies", joint.sample(numpyro.prng_key()))
 
         key = jax.random.fold_in(jax.random.key(seed), OF_SKIES)
-        draw = Predictive(model, chains.sites, batch_ndims=2, return_sites=["skies"])
+        draw = infer.Predictive(model, chains.sites, batch_ndims=2, return_sites=["skies"])
         return dict(zip(channels, np.moveaxis(np.asarray(draw(key)["skies"]), 2, 0), strict=True))
 
 
-class _Channel(Messenger):
+class _Channel(primitives.Messenger):
     """Names a channel's sites, and ties shared ones to earlier channels.
 
     site_values : by site and channel: values, or z if channels differ; only of sites, not of values

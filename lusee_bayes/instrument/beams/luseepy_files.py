@@ -38,9 +38,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy import fft, special
 from scipy.constants import Boltzmann, physical_constants, speed_of_light
-from scipy.fft import dct, dst
-from scipy.special import roots_legendre
 
 from lusee_bayes.core import arrays, formats, harmonics
 from lusee_bayes.core.checks import Described, counted, extent
@@ -124,7 +123,7 @@ class BandLimitedGrid(HemisphereGrid):
         """Return the integrals of each sample's cardinal function times lambda_lm(theta)."""
         n = len(self.theta)
         # exact: the product has degree 2 n + lmax in theta
-        nodes, weights = roots_legendre(4 * n + lmax)
+        nodes, weights = special.roots_legendre(4 * n + lmax)
         fine = np.arccos(nodes)
         polar = harmonics.polar_functions(fine, lmax) * weights[:, None]
         _, m = harmonics.mode_numbers(lmax)
@@ -156,11 +155,11 @@ def cardinal_functions(theta: beam_fields.Angles, intervals: int, parity: int) -
     """
     waves = theta[:, None] * np.arange(intervals + 1)
     if parity == 0:
-        of_wave = dct(np.eye(intervals + 1), type=1, axis=0) / intervals
+        of_wave = fft.dct(np.eye(intervals + 1), type=1, axis=0) / intervals
         of_wave[[0, -1]] /= 2.0
         return np.cos(waves) @ of_wave
     # odd functions are zero at the poles
-    return np.sin(waves) @ np.pad(dst(np.eye(intervals - 1), type=1, axis=0) / intervals, 1)
+    return np.sin(waves) @ np.pad(fft.dst(np.eye(intervals - 1), type=1, axis=0) / intervals, 1)
 
 
 VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]

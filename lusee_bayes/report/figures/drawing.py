@@ -20,18 +20,13 @@ from pathlib import Path
 import numpy as np
 from contourpy import contour_generator
 from jaxtyping import Float
-from matplotlib import colormaps
+from matplotlib import cm, colormaps, colors, patches, patheffects, ticker
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
-from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage, imsave
-from matplotlib.patches import Circle, Ellipse
-from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
-from matplotlib.ticker import LogLocator, MaxNLocator, StrMethodFormatter
 
 from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map, per_mode, taper
@@ -99,14 +94,14 @@ def in_places(
     return figure, list(figure.subplots(rows, columns, gridspec_kw=places, squeeze=False).flat)
 
 
-def temperatures(pixels: Float[np.ndarray, "..."], lowest: float = 0.05) -> Normalize:
+def temperatures(pixels: Float[np.ndarray, "..."], lowest: float = 0.05) -> colors.Normalize:
     """A logarithmic scale over all positive pixels, from percentile ``lowest`` to 99.8.
 
     Linear if no pixel is positive.
     """
     positive = pixels[pixels > 0]
     bounds = np.percentile(positive if positive.size else pixels, [lowest, 99.8])
-    return LogNorm(*bounds) if positive.size else Normalize(*bounds)
+    return colors.LogNorm(*bounds) if positive.size else colors.Normalize(*bounds)
 
 
 def seen_range(std: Float[np.ndarray, "..."], altitude: Pixels) -> tuple[float, float]:
@@ -129,8 +124,8 @@ def seen_range(std: Float[np.ndarray, "..."], altitude: Pixels) -> tuple[float, 
 def plain_ticks(axes: Axes, n: int = 4) -> None:
     """At most ``n`` ticks on each axis, labelled with full numbers instead of an offset."""
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(n))
-        axis.set_major_formatter(StrMethodFormatter("{x:,.8g}"))
+        axis.set_major_locator(ticker.MaxNLocator(n))
+        axis.set_major_formatter(ticker.StrMethodFormatter("{x:,.8g}"))
 
 
 def side_by_side(axes: Axes, data: Float[np.ndarray, "n times"], products: Sequence[str]) -> None:
@@ -155,7 +150,7 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "t
     style = {"cmap": SEQUENTIAL, "vmin": 0, "vmax": 1, "shading": "gouraud", "rasterized": True}
     image = axes.pcolormesh(x, y, closed, **style)
     axes.set(aspect="equal", xticks=[], yticks=[], xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
-    axes.add_artist(Circle((0, 0), 1.0, fill=False, color=GREY, lw=0.8))
+    axes.add_artist(patches.Circle((0, 0), 1.0, fill=False, color=GREY, lw=0.8))
     points = {"N": (0, 1.08), "E": (1.08, 0), "S": (0, -1.08), "W": (-1.08, 0)}
     for name, (px, py) in points.items():
         axes.text(px, py, name, ha="center", va="center", fontsize=8)
@@ -164,14 +159,14 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "t
 
 
 def colour_bar(
-    figure: Figure, image: ScalarMappable, axes: Axes | list[Axes], **options: object
+    figure: Figure, image: cm.ScalarMappable, axes: Axes | list[Axes], **options: object
 ) -> Colorbar:
     """A colour bar; a logarithmic one has plain numbers, and more ticks if it is narrow."""
     bar = figure.colorbar(image, ax=axes, **options)
-    if isinstance(image.norm, LogNorm):
+    if isinstance(image.norm, colors.LogNorm):
         narrow = image.norm.vmax < 20.0 * image.norm.vmin
         subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if narrow else (1.0, 2.0, 5.0)
-        bar.set_ticks(LogLocator(subs=subs), minor=False)
+        bar.set_ticks(ticker.LogLocator(subs=subs), minor=False)
         bar.set_ticks([], minor=True)
         bar.long_axis.set_major_formatter(lambda value, _: f"{value:,.6g}")
     return bar
@@ -190,7 +185,7 @@ WIDTH = 720
 # half the axes of the ellipse
 EDGE = (2.0, 1.0)
 # visible on dark and on light maps
-SEEN_ANYWHERE = [withStroke(linewidth=2.4, foreground="white", alpha=0.7)]
+SEEN_ANYWHERE = [patheffects.withStroke(linewidth=2.4, foreground="white", alpha=0.7)]
 MERIDIANS, PARALLELS = (120.0, 60.0, 0.0, -60.0, -120.0), (-60.0, -30.0, 0.0, 30.0, 60.0)
 
 
@@ -198,7 +193,7 @@ def mollweide(
     axes: Axes,
     pixels: Pixels,
     *,
-    norm: Normalize,
+    norm: colors.Normalize,
     cmap: str = SEQUENTIAL,
     highest_altitude: Coarse | None = None,
 ) -> AxesImage:
@@ -207,9 +202,9 @@ def mollweide(
     ``highest_altitude`` adds a dashed line round the region that never rose.
     """
     # negative temperatures have no logarithm: use the darkest colour; what is undefined is grey
-    bad = colormaps[cmap](0.0) if isinstance(norm, LogNorm) else "lightgrey"
+    bad = colormaps[cmap](0.0) if isinstance(norm, colors.LogNorm) else "lightgrey"
     colours = colormaps[cmap].with_extremes(bad=bad)
-    rim = Ellipse((0.0, 0.0), 2 * EDGE[0], 2 * EDGE[1], fill=False, color="black", lw=0.8)
+    rim = patches.Ellipse((0.0, 0.0), 2 * EDGE[0], 2 * EDGE[1], fill=False, color="black", lw=0.8)
     extent = (-EDGE[0], EDGE[0], -EDGE[1], EDGE[1])
     style = {"origin": "lower", "cmap": colours, "norm": norm, "aspect": "equal"}
     image = axes.imshow(view(pixels), extent=extent, **style)
@@ -230,7 +225,7 @@ def sky_panel(
     axes: Axes,
     title: str,
     pixels: Pixels,
-    norm: Normalize,
+    norm: colors.Normalize,
     cmap: str = SEQUENTIAL,
     unit: str = "K",
     *,

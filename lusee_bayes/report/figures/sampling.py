@@ -9,8 +9,7 @@ import arviz_plots
 import numpy as np
 from arviz_stats.base import array_stats
 from jaxtyping import Float
-from matplotlib import pyplot
-from matplotlib.colors import Normalize
+from matplotlib import colors, pyplot
 from matplotlib.figure import Figure
 
 from lusee_bayes.judge.coverage import LEVELS
@@ -94,12 +93,12 @@ def uncertainty(run: SampleResult) -> Figure | dict[str, Figure]:
     # identical draws have no width, and no asymmetry
     skewness = np.divide(excess, width, out=np.zeros_like(width), where=width > 0)
     limit = np.percentile(np.abs(skewness), 99.0)
-    skewed = Normalize(-limit, limit), drawing.DIVERGING, "fraction of the width"
+    skewed = colors.Normalize(-limit, limit), drawing.DIVERGING, "fraction of the width"
     panels = {"mean of the draws": (maps["mean"], drawing.temperatures(maps["mean"]))}
     spreads = {"standard deviation": maps["std"], "width of the 90 % interval": width}
     for title, kelvin in spreads.items():
         percent = 100.0 * kelvin / maps["mean"].mean()
-        scale = Normalize(*np.percentile(percent, [0.5, 99.5]))
+        scale = colors.Normalize(*np.percentile(percent, [0.5, 99.5]))
         panels[title] = percent, scale, drawing.SEQUENTIAL, "% of the mean sky"
     panels["asymmetry of the 90 % interval about the mean"] = skewness, *skewed
     return drawing.sky_figures(panels, run.highest_altitude)
