@@ -10,8 +10,7 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from lunarsky import MCMF, LunarTopo, MoonLocation
-from scipy.integrate import simpson
-from scipy.special import sph_harm_y
+from scipy import integrate, special
 
 SPEED_OF_LIGHT = 299792458.0
 
@@ -19,7 +18,7 @@ SPEED_OF_LIGHT = 299792458.0
 def real_harmonics(theta, phi, lmax):
     """Orthonormal real harmonics, (points, modes), from scipy's complex ones."""
     ell, m = np.array([(ell, m) for ell in range(lmax + 1) for m in range(-ell, ell + 1)]).T
-    y = sph_harm_y(ell, np.abs(m), np.asarray(theta)[..., None], np.asarray(phi)[..., None])
+    y = special.sph_harm_y(ell, np.abs(m), np.asarray(theta)[..., None], np.asarray(phi)[..., None])
     return np.where(m < 0, -y.imag, y.real) * np.where(m == 0, 1.0, np.sqrt(2.0))
 
 
@@ -141,5 +140,5 @@ def arm_response(
     for direct, reflected in ((e_theta, reflected_theta), (e_phi, reflected_phi)):
         wave = (arm @ direct) * np.exp(1j * k * s * (arm @ n))
         echo = (arm @ reflected) * np.exp(1j * k * s * (arm @ mirrored)) * detour
-        answers.append(simpson(current * (wave + echo), x=s))
+        answers.append(integrate.simpson(current * (wave + echo), x=s))
     return tuple(answers)

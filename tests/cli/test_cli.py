@@ -27,8 +27,7 @@ import lusee_bayes
 from lusee_bayes.cli.commands import app
 from lusee_bayes.cli.options import ScenarioOptions
 from lusee_bayes.cli.tables import checks_table, comparison_table
-from lusee_bayes.core import harmonics, version
-from lusee_bayes.core.arrays import SWITCH
+from lusee_bayes.core import arrays, harmonics, version
 from lusee_bayes.experiment.scenario import OutputSection, load_scenario, scenario_names
 from lusee_bayes.judge.chi2 import HEADLINES
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
@@ -464,7 +463,7 @@ print(sum("cache_hits" in name for name in found), flush=True)
 def compiled(cache, *without):
     """What the program says, in an environment without variables that begin so."""
     own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX", *without))}
-    done = python("-c", COMPILING, env=own | {SWITCH: str(cache)})
+    done = python("-c", COMPILING, env=own | {arrays.SWITCH: str(cache)})
     return done.stdout, done.stderr
 
 

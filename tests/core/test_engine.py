@@ -14,7 +14,6 @@ from rich.console import Console
 
 from lusee_bayes.core import engine, progress
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.progress import Stages
 
 DEMAND = engine.Demand(base_bytes=1e9, task_bytes=1e9)
 
@@ -43,7 +42,7 @@ def joined(a, b):
 
 @pytest.mark.parametrize(("n", "side_by_side"), [(1, 2), (2, 1), (3, 2), (7, 5), (12, 2)])
 def test_results_come_in_order_and_merge_as_a_tree(n, side_by_side):
-    found, stages = engine.ThisProcess(side_by_side), Stages()
+    found, stages = engine.ThisProcess(side_by_side), progress.Stages()
     assert found.each(tasks_of(lambda k: k * k, n), stages, "s") == [k * k for k in range(n)]
     assert found.reduced(tasks_of(str, n), joined, stages, "sum") == tree([*map(str, range(n))])
     assert [*stages.seconds] == ["s", "sum"]
@@ -57,7 +56,7 @@ def test_so_many_are_carried_out_at_a_time():
         together.wait()
         return k
 
-    assert engine.ThisProcess(2).each(tasks_of(meet, 6), Stages(), "s") == list(range(6))
+    assert engine.ThisProcess(2).each(tasks_of(meet, 6), progress.Stages(), "s") == list(range(6))
     now = set()
 
     def alone(k):
@@ -66,7 +65,7 @@ def test_so_many_are_carried_out_at_a_time():
         assert now == {k}
         now.remove(k)
 
-    engine.ThisProcess(1).each(tasks_of(alone, 5), Stages(), "s")
+    engine.ThisProcess(1).each(tasks_of(alone, 5), progress.Stages(), "s")
 
 
 def test_a_failure_ends_the_stage():
@@ -78,9 +77,9 @@ def test_a_failure_ends_the_stage():
             raise InputError("of number 1")
         time.sleep(0.2)
 
-    refuse("of number 1", engine.ThisProcess(1).each, tasks_of(fail, 5), Stages(), "s")
+    refuse("of number 1", engine.ThisProcess(1).each, tasks_of(fail, 5), progress.Stages(), "s")
     assert begun[:2] == [0, 1] and len(begun) < 4
-    assert engine.ThisProcess().each(tasks_of(abs, 0), Stages(), "s") == []
+    assert engine.ThisProcess().each(tasks_of(abs, 0), progress.Stages(), "s") == []
 
 
 def opened(demand=DEMAND, **given):
@@ -172,7 +171,7 @@ def test_what_is_shared_is_computed_once():
 def test_a_file_has_a_line_for_each_five_percent_of_long_stages(line_s, expected, monkeypatch):
     monkeypatch.setattr(progress, "LINE_S", line_s)
     file = io.StringIO()
-    with Stages(Console(file=file)).progress("channels [x]", 200) as done:
+    with progress.Stages(Console(file=file)).progress("channels [x]", 200) as done:
         for number in range(1, 201):
             done(number, "20 MHz")
     *lines, last = file.getvalue().splitlines()

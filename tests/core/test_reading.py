@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lusee_bayes.core import formats, layouts, reading
-from lusee_bayes.core.formats import require_readable_hdf5
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 
 LAYOUT = Layout(
@@ -98,12 +97,12 @@ def path(tmp_path):
 
 
 def test_a_file_without_end_is_refused(path, monkeypatch):
-    require_readable_hdf5(path)  # a whole one is read
+    formats.require_readable_hdf5(path)  # a whole one is read
     formats._probe.cache_clear()
     monkeypatch.setattr(formats, "LIMIT_S", 0.2)
     monkeypatch.setattr(formats, "_read_all", lambda path, size: time.sleep(60))
     start = time.monotonic()
-    refuse(r"reading.*0\.2 s", require_readable_hdf5, path)
+    refuse(r"reading.*0\.2 s", formats.require_readable_hdf5, path)
     assert time.monotonic() - start < 30
 
 
@@ -121,7 +120,7 @@ def test_a_name_whose_search_has_no_end_is_refused_even_where_none_can_be_listed
     formats._probe.cache_clear()
     monkeypatch.setattr(formats, "LIMIT_S", 0.2)
     monkeypatch.setattr(formats.h5py, "File", lambda path: nullcontext(file))
-    refuse(r"reading.*0\.2 s", require_readable_hdf5, path)
+    refuse(r"reading.*0\.2 s", formats.require_readable_hdf5, path)
 
 
 def test_a_file_that_ends_the_process_is_refused(path, monkeypatch):
@@ -130,7 +129,7 @@ def test_a_file_that_ends_the_process_is_refused(path, monkeypatch):
         os.abort()
 
     monkeypatch.setattr(formats, "_read_all", end)
-    refuse("HDF5's library fails on it", require_readable_hdf5, path)
+    refuse("HDF5's library fails on it", formats.require_readable_hdf5, path)
 
 
 TEXT = st.text(max_size=10)

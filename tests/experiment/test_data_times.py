@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from assertions import refuse, within
 from fits_files import write_products
-from scipy import stats
-from scipy.linalg import eigh
+from scipy import linalg, stats
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import digest_of, items_of
@@ -269,7 +268,7 @@ def maps(request):
 
 
 def test_as_much_is_lost_as_the_planner_says(maps):
-    ratios = eigh(maps.windows.covariance(), maps.fine.covariance(), eigvals_only=True)
+    ratios = linalg.eigh(maps.windows.covariance(), maps.fine.covariance(), eigvals_only=True)
     # N of averages has the squares of mean autos, which are smaller than the mean squares
     noise = maps.averaged(maps.fine.model.noise.diagonal())
     samples = noise.observation.live_s[noise.layout.time] / maps.samples.observation.step_s

@@ -8,9 +8,8 @@ import pytest
 from experiments import rms_of_directions
 
 import lusee_bayes as lb
-from lusee_bayes.experiment import validity
+from lusee_bayes.experiment import rounds, validity
 from lusee_bayes.experiment.model import base_model, moved, set_up
-from lusee_bayes.experiment.rounds import Inference, model_about, settled
 from lusee_bayes.systematics.context import Around
 
 ISOTROPIC = "prior={model: isotropic}"
@@ -90,8 +89,8 @@ def test_a_clock_that_is_off_turns_the_sky_alone(spots):
 def test_what_is_an_unknown_is_no_blind_spot():
     given = "noise.beam={parameters: {surface_permittivity: 0.1}}", "noise.fields={lmax: 1}"
     setup = set_up(scenario_of(ISOTROPIC, *given, lmax=4, step_s=86400.0))
-    model, held = model_about(setup, Around())
-    found = Inference(model.condition(np.zeros(model.n_data)), held, 1, Around())
+    model, held = rounds.model_about(setup, Around())
+    found = rounds.Inference(model.condition(np.zeros(model.n_data)), held, 1, Around())
     names = [one.name for one in validity.blind_spots(setup, found, setup.sky.modes)]
     assert "deep_permittivity" in names
     assert not {"surface_permittivity", validity.FIELDS_NAME} & set(names)
@@ -120,8 +119,8 @@ def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them(monke
     assert k < validity.LARGEST_K and moved_by < 0.1 * validity.LARGEST_MOVE
     assert validity.reach(experiment, found) == ([], [])
     # about the prior's means, two standard deviations off, the first order is far from the model
-    model, held = model_about(setup, Around(experiment.data))
-    first = Inference(model.condition(d), held, 1, Around(experiment.data))
+    model, held = rounds.model_about(setup, Around(experiment.data))
+    first = rounds.Inference(model.condition(d), held, 1, Around(experiment.data))
     k, moved_by = validity.weighed(setup, d, first)
     # the map there is wrong by as much as it moves when N is built about what was found
     wrong = rms_of_directions(first, found.posterior.mean)
@@ -149,7 +148,7 @@ def test_turns_that_the_sky_can_follow_are_in_n_to_second_order(seed):
     offsets = f"noise.pointing={{{OFFSETS}}}"
     experiment = lb.build(scenario_of(offsets, f"seed={seed}", lmax=8, step_s=21600.0))
     found, truth = lb.infer(experiment), experiment.setup.sky.modes
-    first = rms_of_directions(settled(experiment.setup, Around(experiment.data)), truth)
+    first = rms_of_directions(rounds.settled(experiment.setup, Around(experiment.data)), truth)
     assert 0.75 < rms_of_directions(found, truth) < 1.3 < 0.1 * first
     doubts, notes = validity.reach(experiment, found)
     assert not doubts and "the second order of noise.pointing" in notes[0]

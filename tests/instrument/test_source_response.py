@@ -7,8 +7,7 @@ import pytest
 from assertions import close, refuse
 from astropy.time import Time
 from reference import hemisphere, real_harmonics, vectors
-from scipy.signal import hilbert
-from scipy.special import eval_legendre
+from scipy import signal, special
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams import monopoles as mp
@@ -123,7 +122,7 @@ def test_a_field_that_turns_in_time(stokes_v):
         np.testing.assert_allclose(np.cross(a, b), -n, atol=1e-15)
         field = np.cos(phase)[:, None] * a + stokes_v * np.sin(phase)[:, None] * b
         # of real voltages, the part that turns as exp(+i w t); the wave carries I = 1
-        signals = hilbert(field @ arms.T, axis=0) / np.sqrt(2.0)
+        signals = signal.hilbert(field @ arms.T, axis=0) / np.sqrt(2.0)
         expected.append(signals.T @ signals.conj() / len(phase))
     # in units of the autos' integral, of (1 - (n.arm)^2) / 2 over half the sphere
     norm = 2.0 * np.pi / 3.0
@@ -152,7 +151,7 @@ def around(n0, g, reach, n_radius, n_angle):
     height = 1 - np.cos(reach)  # Gauss nodes in sqrt(1 - cos gamma), about the radius
     root = (x + 1) / 2 * np.sqrt(height)
     cosine, ring = 1 - root**2, w / 2 * np.sqrt(height) * 2 * root * 2 * np.pi / n_angle
-    terms = ((2 * ell + 1) * g[ell] * eval_legendre(ell, cosine) for ell in range(len(g)))
+    terms = ((2 * ell + 1) * g[ell] * special.eval_legendre(ell, cosine) for ell in range(len(g)))
     kernel, across = sum(terms) / (4 * np.pi), np.cross(n0, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
     other, alpha = np.cross(n0, across), 2 * np.pi * (np.arange(n_angle) + 0.5) / n_angle

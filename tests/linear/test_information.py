@@ -9,8 +9,7 @@ import pytest
 from assertions import assert_same_map, refuse
 from experiments import of_run
 from reference_linear import posterior, random_covariance
-from scipy.linalg import block_diag
-from scipy.stats import multivariate_normal
+from scipy import linalg, stats
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
@@ -45,7 +44,7 @@ def test_likelihoods_and_sums_are_those_of_matrices():
     expected = []
     for m, d in zip(models, data, strict=True):
         left = np.asarray(d) - np.array([m.predict(sky) for sky in skies])
-        expected.append(multivariate_normal(np.zeros(m.n_data), m.noise.dense()).logpdf(left))
+        expected.append(stats.multivariate_normal(np.zeros(m.n_data), m.noise.dense()).logpdf(left))
     for part, likelihoods in zip(parts, expected, strict=True):
         np.testing.assert_allclose(part.log_likelihood(skies), likelihoods, rtol=TOL)
     # whichever is first
@@ -71,7 +70,7 @@ def test_the_posterior_of_a_sum_is_that_of_all_data(kind):
     solutions = [model.condition(d) for model, d in zip(models, data, strict=True)]
     total = solutions[1].information + solutions[0].information
     a = np.concatenate([np.asarray(model.coupling.dense()) for model in models])
-    noise = block_diag(*(np.asarray(model.noise.dense()) for model in models))
+    noise = linalg.block_diag(*(np.asarray(model.noise.dense()) for model in models))
     offset = np.concatenate([np.asarray(model.offset) for model in models])
     every, prior = np.concatenate([np.asarray(d) for d in data]), PRIORS[kind]()
     mean = np.zeros(N) if prior.mean is None else np.asarray(prior.mean)

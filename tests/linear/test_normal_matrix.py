@@ -9,8 +9,7 @@ import pytest
 from assertions import close, off, refuse
 
 import lusee_bayes as lb
-from lusee_bayes.core.arrays import on_device, on_host
-from lusee_bayes.core.harmonics import pixel_matrix
+from lusee_bayes.core import arrays, harmonics
 from lusee_bayes.instrument.averaging import windowed
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.pointing import Pointing
@@ -68,7 +67,7 @@ def noise_of(kind, layout):
 KINDS = ["diagonal", "blocks", "templates", pytest.param("banded", marks=pytest.mark.long)]
 
 
-@pytest.mark.parametrize("place", [on_host, on_device])
+@pytest.mark.parametrize("place", [arrays.on_host, arrays.on_device])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("order", "missing"), [(0, True), (1, True), (2, True), (2, False)])
 def test_equals_the_product_of_matrices(place, kind, order, missing):
@@ -97,7 +96,7 @@ def test_more_times_than_a_chunk():
 
 @pytest.mark.parametrize("blocks", [False, True])
 def test_products_without_weight_take_no_part(blocks):
-    coupling = on_host(setting(missing=False))
+    coupling = arrays.on_host(setting(missing=False))
     rng, n_times = np.random.default_rng(5), coupling.layout.n_times
     weights = np.zeros((N_PRODUCTS, N_PRODUCTS, n_times))
     weights[1, 1], weights[3, 3] = rng.uniform(1.0, 2.0, (2, n_times))
@@ -110,7 +109,7 @@ def test_products_without_weight_take_no_part(blocks):
 
 def test_nearly_singular_blocks_lose_no_digits():
     """Eigenvalues of 1 to 1e-9: with inverses, 1 + A^T N^-1 A would not be positive."""
-    coupling = on_host(setting(missing=False))
+    coupling = arrays.on_host(setting(missing=False))
     q = np.linalg.qr(np.random.default_rng(2).normal(size=(N_PRODUCTS, N_PRODUCTS)))[0]
     block = (q * np.logspace(0, -9, N_PRODUCTS)) @ q.T
     blocks = np.tile((block + block.T) / 2.0, (coupling.layout.n_times, 1, 1))
@@ -191,5 +190,5 @@ def test_information_that_cannot_settle_says_so(monkeypatch):
 def test_pixel_variances_are_those_of_every_direction(lmax, nside):
     n = (lmax + 1) ** 2
     a = np.random.default_rng(lmax).standard_normal((n, n + 2))
-    expected = np.sqrt(((pixel_matrix(nside, lmax) @ a) ** 2).sum(1))
+    expected = np.sqrt(((harmonics.pixel_matrix(nside, lmax) @ a) ** 2).sum(1))
     np.testing.assert_allclose(pixel_std(jnp.asarray(a @ a.T), nside), expected, rtol=1e-12)

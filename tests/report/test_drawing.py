@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.projections.geo import MollweideAxes
 
 from lusee_bayes.core import harmonics
-from lusee_bayes.core.harmonics import map_to_modes, modes_to_map
 from lusee_bayes.judge.convergence import warnings_of
 from lusee_bayes.report.figures import drawing
 from lusee_bayes.report.rendering import ENVIRONMENT, formatted, p_value, picture, render
@@ -68,8 +67,8 @@ def test_an_edge_has_no_rings(lmax):
     # that a tenth of the swing is allowed.
     pixels = np.ones(12 * 64**2)
     pixels[np.abs(healpy.pix2ang(64, np.arange(pixels.size), lonlat=True)[1]) < 5.0] = 10.0
-    modes = map_to_modes(pixels, lmax)
-    swing = 1.0 - modes_to_map(modes, 64).min()
+    modes = harmonics.map_to_modes(pixels, lmax)
+    swing = 1.0 - harmonics.modes_to_map(modes, 64).min()
     assert swing > 0.5
     assert drawing.shown(modes, 64).min() > 1.0 - 0.1 * swing
     # the mean is kept

@@ -13,8 +13,7 @@ from reference_linear import matrices
 from scipy import stats
 
 import lusee_bayes as lb
-from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.core import arrays, harmonics
 from lusee_bayes.experiment import rounds
 from lusee_bayes.experiment.model import set_up, simulate
 from lusee_bayes.judge.chi2 import stands_out
@@ -35,7 +34,7 @@ def dense_log_likelihood(model, data, skies) -> np.ndarray:
 
 def dense_z(judged, data) -> np.ndarray:
     """Every datum against all others, of independent noise: K^-1 = N^-1 - (Q of a QR) (its Q)^T."""
-    model, n = on_host(judged.model), len(data)
+    model, n = arrays.on_host(judged.model), len(data)
     prior = Split.of(judged.posterior, judged.solution.chi2, n).wide.prior
     a, std = np.asarray(model.coupling.dense()), np.sqrt(np.asarray(model.noise.diagonal()))
     white = prior.colour_columns(a) / std[:, None]
@@ -267,7 +266,7 @@ def test_its_resolution_is_packed(dense):
     made, channel = dense
     details = channel.details
     width = details.prior_width
-    ell, _ = mode_numbers(LMAX)
+    ell, _ = harmonics.mode_numbers(LMAX)
     steps, scale = details.resolution_step[np.ix_(ell, ell)], width[:, None] / width[None]
     found = details.resolution * steps * scale
     s = np.asarray(made.from_data.model.prior.covariance())

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from experiments import mapped
 
-from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
-from lusee_bayes.core.trees import from_tree, to_tree
+from lusee_bayes.core import harmonics, trees
 from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.model import set_up
 from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
@@ -43,7 +42,7 @@ def test_pixels_are_counted_by_latitude():
     rng = np.random.default_rng(1)
     std = rng.uniform(0.5, 2.0, 12 * NSIDE**2)
     error, draws = rng.standard_normal(N_MODES), rng.standard_normal((7, N_MODES))
-    pull, *drawn = [modes_to_map(sky, NSIDE) / std for sky in (error, *draws)]
+    pull, *drawn = [harmonics.modes_to_map(sky, NSIDE) / std for sky in (error, *draws)]
     b = np.degrees(np.pi / 2 - healpy.pix2ang(NSIDE, np.arange(len(std)))[0])
     found = Counts.of_pixels(std, error, draws).coverage()
     names = ["|b| < 10 deg", "|b| 10 to 30 deg", "|b| > 30 deg", "whole sky"]
@@ -51,7 +50,7 @@ def test_pixels_are_counted_by_latitude():
     for part, (low, high) in zip(found, [(0, 10), (10, 30), (30, 90), (0, 90)], strict=True):
         here = [k for k in range(len(b)) if low <= abs(b[k]) < high]
         compare(part, pull[here], [draw[here] for draw in drawn])
-        assert from_tree(Coverage, to_tree(part), "a file") == part
+        assert trees.from_tree(Coverage, trees.to_tree(part), "a file") == part
 
 
 @pytest.fixture(scope="module")
@@ -61,11 +60,11 @@ def ensemble():
     rng = np.random.default_rng(3)
     prior = 3.0 / (1.0 + np.repeat(np.arange(LMAX + 1), 2 * np.arange(LMAX + 1) + 1))
     # data that know the north better than the south, and large scales better than small ones
-    y = pixel_matrix(4, LMAX)
+    y = harmonics.pixel_matrix(4, LMAX)
     a = y[np.arange(len(y)) < len(y) // 3] / 0.2
     covariance = np.linalg.inv(a.T @ a + np.diag(prior**-2.0))
     root = np.linalg.cholesky(covariance)
-    std = np.sqrt(((pixel_matrix(NSIDE, LMAX) @ root) ** 2).sum(1))
+    std = np.sqrt(((harmonics.pixel_matrix(NSIDE, LMAX) @ root) ** 2).sum(1))
 
     def coverage():
         sky = prior * rng.standard_normal(N_MODES)
@@ -137,7 +136,7 @@ def test_strengths_are_squares_over_what_is_expected():
     of_pixels = rng.uniform(0.5, 2.0, 12 * NSIDE**2)
     found = strengths(sky, of_modes, of_pixels)
     assert found["ell 5 to 6"] == pytest.approx((sky[25:] ** 2).sum() / of_modes[25:].sum())
-    pixels = pixel_matrix(NSIDE, LMAX)[:, 1:] @ sky[1:]
+    pixels = harmonics.pixel_matrix(NSIDE, LMAX)[:, 1:] @ sky[1:]
     cap = np.arange(12 * NSIDE**2) < 100  # |b| > 30 degrees holds the whole cap
     assert found["|b| > 30 deg"] > (pixels[cap] ** 2).sum() / of_pixels.sum()
     bands = ["|b| < 10 deg", "|b| 10 to 30 deg", "|b| > 30 deg"]

@@ -13,8 +13,7 @@ from experiments import flagged
 from reference_linear import matrices
 
 import lusee_bayes as lb
-from lusee_bayes.core import engine, progress
-from lusee_bayes.core.harmonics import sum_over_m
+from lusee_bayes.core import engine, harmonics, progress
 from lusee_bayes.experiment.model import full_model, set_up
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.judge.measures import ell_cross
@@ -79,8 +78,8 @@ def test_expected_snr_is_that_of_simulated_maps():
     faint = turned(0, 30, factor=1e7)  # SNR^2 from 120 to 0.2
     predicted = plan_run.forecast(faint)
     model, _, skies, means = simulated(faint)
-    power, error = sum_over_m(means**2), sum_over_m((means - skies) ** 2)
-    prior = sum_over_m(np.asarray(model.prior.variance()))
+    power, error = harmonics.sum_over_m(means**2), harmonics.sum_over_m((means - skies) ** 2)
+    prior = harmonics.sum_over_m(np.asarray(model.prior.variance()))
     left = prior / (1.0 + predicted.snr_squared)
     for values, expected in ((power, prior - left), (error, left)):
         tolerance = 4.5 * values.std(axis=0, ddof=1) / np.sqrt(N_SETS)
@@ -107,7 +106,7 @@ def assert_forecast_is(found, a, s, n):
     # (S - C) x = lambda C x
     ratios = scipy.linalg.eigh(s - c, s, eigvals_only=True)
     assert found.modes == (ratios / (1.0 - ratios) > 1.0).sum()
-    known, left = (sum_over_m(np.diag(x)) for x in (s - c, c))
+    known, left = (harmonics.sum_over_m(np.diag(x)) for x in (s - c, c))
     np.testing.assert_allclose(found.snr_squared, known / left, rtol=1e-5)
 
 

@@ -12,8 +12,7 @@ import numpyro
 import pytest
 from assertions import refuse
 from numpyro import distributions as dist
-from numpyro import handlers
-from numpyro.infer import Predictive
+from numpyro import handlers, infer
 from numpyro.infer.util import log_density
 from reference_linear import assert_draws_follow, matrices, z_of
 from scipy.stats import multivariate_normal
@@ -180,7 +179,7 @@ def test_predictions_from_draws_of_z(gaussian, case):
     z = jax.random.normal(jax.random.key(3), (n, 9), dtype=jnp.float64)
     free = {**arguments, "data": None}
     with programs.numpyro_promotion():
-        predictive = Predictive(whitened(program("sky"), whitening), {"sky_white": z})
+        predictive = infer.Predictive(whitened(program("sky"), whitening), {"sky_white": z})
         drawn = predictive(jax.random.key(4), **free)
     expected = np.asarray(whitening.mean) + np.asarray(z) @ np.asarray(whitening.root).T
     np.testing.assert_allclose(drawn["sky"], expected, rtol=1e-13, atol=1e-13)

@@ -14,7 +14,6 @@ from lusee_bayes.linear.linear_gaussian import Form, InData, InMap
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling import validation
-from lusee_bayes.sampling.validation import FALSE_ALARM, NULL_RUNS, Check, validate_draws
 
 LMAX, MODES = 3, 16
 CHAINS, DRAWS = 4, 500
@@ -73,7 +72,7 @@ def wrong_posterior(mean: np.ndarray, covariance: np.ndarray) -> Posterior:
 
 def judge(draws, energy, posterior, diverging=None, seed=0):
     diverging = np.zeros(energy.shape, bool) if diverging is None else diverging
-    return validate_draws(draws, posterior, diverging, energy, seed=seed)
+    return validation.validate_draws(draws, posterior, diverging, energy, seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +133,7 @@ def test_numbers_are_those_of_numpy_and_scipy(truth):
     assert values["tail ESS"] == found.ess_tail.min()
     limits = {check.name: check.upper for check in found.checks}
     # two-sided, shared by all modes
-    assert stats.norm.sf(limits["mean"]) * 2 * MODES == pytest.approx(FALSE_ALARM)
+    assert stats.norm.sf(limits["mean"]) * 2 * MODES == pytest.approx(validation.FALSE_ALARM)
 
 
 # --- wrong posteriors fail --------------------------------------------------------------------
@@ -250,8 +249,8 @@ def test_draws_that_cannot_be_compared_are_refused(truth, broken, message):
 
 def test_a_check_includes_its_limits_and_refuses_nan():
     for value, passed in [(1.0, True), (2.0, True), (0.999, False), (2.001, False)]:
-        assert Check("name", value, 1.0, 2.0, "").passed is passed
-    assert not Check("name", float("nan"), -np.inf, np.inf, "").passed
+        assert validation.Check("name", value, 1.0, 2.0, "").passed is passed
+    assert not validation.Check("name", float("nan"), -np.inf, np.inf, "").passed
 
 
 def test_scores_of_variances_have_the_tails_of_chi2():
@@ -273,7 +272,7 @@ def test_eigenvalues_of_independent_draws_lie_between_the_marchenko_pastur_edges
     p, n = 60, CHAINS * 400
     white = np.random.default_rng(1).standard_normal((CHAINS, 400, p))
     null = validation._null_eigenvalues(white, np.random.default_rng(2))
-    assert null.shape == (NULL_RUNS, p)
+    assert null.shape == (validation.NULL_RUNS, p)
     assert (np.diff(null, axis=1) >= 0).all()
     for end, sign in [(-1, 1.0), (0, -1.0)]:
         edge = np.sqrt(n) + sign * np.sqrt(p)
@@ -282,7 +281,7 @@ def test_eigenvalues_of_independent_draws_lie_between_the_marchenko_pastur_edges
         assert abs(null[:, end].mean() - (edge**2 / n - sign * 1.2065 * width)) < 2.0 * width
         assert 0.4 * width < null[:, end].std(ddof=1) < 3.0 * width
     # the mean eigenvalue is the trace: chi^2 of all numbers
-    assert abs(null.mean() - 1) < 5 * np.sqrt(2 / (NULL_RUNS * n * p))
+    assert abs(null.mean() - 1) < 5 * np.sqrt(2 / (validation.NULL_RUNS * n * p))
 
 
 def test_draws_that_turn_round_count_once_in_the_covariance():

@@ -15,7 +15,6 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment import experiment, rounds
 from lusee_bayes.experiment.model import set_up, simulate
-from lusee_bayes.experiment.rounds import Inference, settled
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.runs import channels
@@ -42,7 +41,7 @@ def scenario(mhz: float, angles: int, **more) -> Scenario:
     return Scenario.model_validate(tree | more)
 
 
-def of_another_sky(folder: Path, mhz: float, angles: int, **more) -> tuple[Setup, Inference]:
+def of_another_sky(folder: Path, mhz: float, angles: int, **more) -> tuple[Setup, rounds.Inference]:
     """Infer what data of a published map tell, which is not drawn from the prior."""
     file = SKIES[mhz]
     if not (folder / file).exists():
@@ -104,7 +103,7 @@ def test_error_bars_of_all_together_are_right():
         white = np.random.default_rng(seed).standard_normal(prior.size)
         sky = np.asarray(prior.colour(white)) + np.asarray(prior.mean)
         truth = own.under(replace(own.sky, modes=sky))
-        found = settled(replace(own, measured=True), Around(simulate(truth)))
+        found = rounds.settled(replace(own, measured=True), Around(simulate(truth)))
         assert not found.unsettled
         columns = np.concatenate([np.asarray(part.columns) for part in found.expanded], axis=1)
         told = template_amplitudes(found.solution, columns)
