@@ -7,6 +7,7 @@ import pytest
 from assertions import refuse
 from experiments import unknowns_report
 from naive_flight import naive_band
+from tables import tables
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import per_kelvin_of, reduce_files
@@ -18,6 +19,8 @@ from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.products import all_products, auto_indices, labels
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.noise.radiometer import exact_blocks
+
+TABLES = tables(__file__)
 
 FREQUENCIES = [10.0, 25.0]
 SMALL = ["lmax=4", f"frequencies_mhz={FREQUENCIES}", "flight={per_kelvin_v2_hz: 1e-21}"]
@@ -45,15 +48,9 @@ def relative_error(reduced, truth):
 QUIET = "flight.simulated.radiometer=false"
 # what the spectrum does within a band of 1 MHz beyond a parabola is 6e-6 at 10 MHz
 EXACT = "flight.degree=4"
-STATES = [
-    ("navgf: 2, kind: fits, session_h: 1.4", "flight.bin_origin=edge"),
-    ("navgf: 3, levels: LMHM", "flight.convention=conj(s_i) s_j"),
-    ("navgf: 4, levels: LLLL, clock: unknown", "flight.bin_origin=edge"),
-    ("switch_h: 2.2, levels: HHHH", "flight.convention=conj(s_i) s_j"),
-]
 
 
-@pytest.mark.parametrize(("state", "more"), STATES)
+@pytest.mark.parametrize(("state", "more"), TABLES["states"])
 def test_visibilities_come_back(tmp_path, state, more):
     state = f"flight.simulated={{radiometer: false, {state}}}"
     reduced, truth = simulated(tmp_path, EXACT, state, more)
@@ -201,18 +198,7 @@ def test_the_same_seed_makes_the_same_disturbances_and_noise(tmp_path):
         np.testing.assert_array_equal(values, second[name])
 
 
-NO_SESSIONS = [
-    (["flight=null"], "not calibrated in volts"),
-    (["noise.radiometer.duty_cycle=0.5"], "remove duty_cycle"),
-    (["flight.filter_taps=4"], "independent noise"),
-    (["observation.step_s=1e-5", "observation.runs=[{cycles: 1e-10}]"], "a frame of"),
-    (["noise.gain_table={}"], "errors of the gains: flight.gain_std"),
-    (["noise.gain_table={std: 0.01}"], "give flight.gain_std, the error of the gains"),
-    (["noise.gain_table={}", "flight.gain_std=0.9", "seed=2"], "is negative"),
-]
-
-
-@pytest.mark.parametrize("changes, text", NO_SESSIONS)
+@pytest.mark.parametrize("changes, text", TABLES["no sessions"])
 def test_what_makes_no_sessions_is_refused(changes, text):
     refuse(text, simulate_flight, lb.load_scenario("fiducial", [*SMALL, *changes]))
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from assertions import refuse, refused
 from fits_files import write_images
+from tables import tables
 
 from lusee_bayes.core.reading import as_yaml, parse_yaml
 from lusee_bayes.core.section import FILES
@@ -16,6 +17,8 @@ from lusee_bayes.experiment.instrument_sections import ResponseSection, ScalarBe
 from lusee_bayes.experiment.keys import keys_as_markdown, scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario, scenario_names
 from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection, IsotropicPriorSection
+
+TABLES = tables(__file__)
 
 
 def test_the_fiducial_scenario_is_the_papers():
@@ -105,26 +108,9 @@ def test_every_entry_that_names_a_file_is_known():
     assert files <= set(FILES) and set(FILES) - files == others
 
 
-SHIPPED = {
-    "noise_x10": "noise.radiometer.factor=10",
-    "noise_x100": "noise.radiometer.factor=100",
-    "duty_cycle_50": "noise.radiometer.duty_cycle=0.5",
-    "gain_1e-2": "noise.gain={sigma: 0.01, correlation_h: 10, visibilities: model}",
-    "gain_1e-3": "noise.gain={sigma: 0.001, correlation_h: 10, visibilities: model}",
-    "gain_ignored": "noise.gain={sigma: 0.01, correlation_h: 10, treatment: ignored}",
-    "beam_4MHz": "noise.beam={shift_mhz: 4}",
-    "beam_0.4MHz": "noise.beam={shift_mhz: 0.4}",
-    "beam_ignored": "noise.beam={shift_mhz: 4, treatment: ignored}",
-    "two_cycles": "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]",
-    "three_cycles": "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}, "
-    "{cycles: 1, turntable_deg: 60}]",
-    "quarter_cycle": "observation.runs=[{cycles: 0.25}]",
-}
-
-
 def test_shipped_scenarios_are_what_their_names_say():
-    assert {"fiducial", *SHIPPED} <= set(scenario_names())
-    for name, change in SHIPPED.items():
+    assert {"fiducial", *TABLES["shipped"]} <= set(scenario_names())
+    for name, change in TABLES["shipped"].items():
         assert load_scenario(name) == load_scenario("fiducial", [change]), name
 
 
@@ -237,23 +223,6 @@ def test_the_section_of_another_file_is_put_up_alike(response, scalar):
 
 KEYS = scenario_keys()
 PAGE = Path(__file__).parents[2] / "docs" / "keys.md"
-# how sections and lists that are empty by default come to be there
-WITHIN = {
-    "noise.gain": "noise.gain={}",
-    "noise.beam": "noise.beam={shift_mhz: 4}",
-    "noise.fields": "noise.fields={}",
-    "noise.horizon": "noise.horizon={std_deg: 1, file: horizon.csv}",
-    "noise.pointing": "noise.pointing={clock_s: 60}",
-    "noise.receiver": "noise.receiver={power_k: 100}",
-    "noise.regolith": "noise.regolith={std_k: 20}",
-    "noise.polarisation": "noise.polarisation={}",
-    "noise.above_lmax": "noise.above_lmax={}",
-    "noise.gain_table": "noise.gain_table={std: 0.01}",
-    "prior.surveys.0": "prior={model: local_scales, surveys: [{file: x, frequency_mhz: 45.0}]}",
-    "sources.list.0": "sources.list=[{name: Cas A}]",
-    "flight": "flight={}",
-    "flight.simulated": "flight.simulated={}",
-}
 
 
 def leaves(tree, prefix=""):
@@ -266,7 +235,7 @@ def leaves(tree, prefix=""):
 
 
 def test_every_key_of_a_written_scenario_is_listed_and_explained():
-    scenario = load_scenario("fiducial", [*WITHIN.values(), "sky.sources=false"])
+    scenario = load_scenario("fiducial", [*TABLES["within"].values(), "sky.sources=false"])
     written = set(leaves(parse_yaml(scenario.to_yaml(), "the file")))
     listed = {key.path for key in KEYS}
     parents = {path for path in written if any(p.startswith(f"{path}.") for p in listed)}
@@ -290,7 +259,7 @@ DEFAULTS = [
 
 @pytest.mark.parametrize("key", DEFAULTS, ids=lambda key: key.path)
 def test_a_default_changes_nothing(plain, key):
-    before = [text for name, text in WITHIN.items() if key.path.startswith(f"{name}.")]
+    before = [text for name, text in TABLES["within"].items() if key.path.startswith(f"{name}.")]
     value = "false" if key.path == "sky.sources" else key.default
     assert load_scenario(plain, [*before, f"{key.path}={value}"]) == load_scenario(plain, before)
 
@@ -304,7 +273,7 @@ OF_KIND |= {name: (RECEIVER % name).replace(", file: x}}", "}}") for name in ("j
 
 def of_kind(key):
     """Overrides by which the section of a key is there, of its kind."""
-    before = [text for name, text in WITHIN.items() if key.path.startswith(f"{name}.")]
+    before = [text for name, text in TABLES["within"].items() if key.path.startswith(f"{name}.")]
     if key.kind == "file":
         before += ["sky={model: file, file: x}" if key.path[0] == "s" else RECEIVER % "file"]
     return before + ([OF_KIND[key.kind]] if key.kind in OF_KIND else [])

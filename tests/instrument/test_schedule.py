@@ -6,9 +6,12 @@ import pytest
 from assertions import refuse, within
 from astropy.time import Time
 from reference import is_dark
+from tables import tables
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run, read_schedule
+
+TABLES = tables(__file__)
 
 # three lunar nights at half duty, the table turned in the middle of the first and of the last
 NIGHTS = """\
@@ -222,19 +225,7 @@ def test_a_command_table_of_opsim(write):
     assert lb.Observation.from_schedule(intervals).n_runs == 1
 
 
-BAD_COMMANDS = [
-    ("", "comtable.yml is not a command table of OpSim: expected numbered entries"),
-    ("1: [\n", "comtable.yml is not valid YAML"),
-    ("1: {start: 61050.8}\n", "entry 1: a command table of OpSim needs a start .* and a mode"),
-    ("1:\n  start: noon\n  mode: science\n", "entry 1: a command table of OpSim needs a start"),
-    ("1: {start: 2461050.8, mode: science}\n", "entry 1: 8597.* is outside the ephemer"),
-    ("1: {start: 61051, mode: science}\n2: {start: 61050, mode: maint}\n", "entry 2.*; sort"),
-    ("1: {start: 61050.8, mode: maint}\n", "comtable.yml: a schedule needs at least one"),
-    ("1: {start: 61050, mode: maint}\n2: {start: 61051, mode: science}\n", "2.* has no end"),
-]
-
-
-@pytest.mark.parametrize(("text", "message"), BAD_COMMANDS)
+@pytest.mark.parametrize(("text", "message"), TABLES["bad commands"])
 def test_bad_command_tables_are_refused(write, text, message):
     refuse(message, read_schedule, write(text, "comtable.yml"))
 

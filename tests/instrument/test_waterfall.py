@@ -12,6 +12,7 @@ from astropy.time import Time, TimeDelta
 from commands import judged_map, refused, run
 from fits_files import HEADER, write_images
 from fits_files import write_products as write
+from tables import tables
 
 import lusee_bayes as lb
 from lusee_bayes.cli.options import parse_frequencies
@@ -19,6 +20,8 @@ from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.model import set_up
 from lusee_bayes.instrument.products import DataLayout, labels
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
+
+TABLES = tables(__file__)
 
 
 def test_every_sample_is_in_its_place(tmp_path):
@@ -33,16 +36,7 @@ def test_every_sample_is_in_its_place(tmp_path):
     assert observation.step_s == 7200.0 and observation.turntable_deg == (0.0,)
 
 
-RANGES = [
-    ("CY2027", "2027-01-01T01:00:00.000"),  # luseepy begins them at one o'clock
-    ("CY27", "2027-01-01T01:00:00.000"),
-    ("FY27", "2026-10-01T00:00:00.000"),
-    ("FY2027", "2026-10-01T00:00:00.000"),
-    ("2027-02-01 13:00:00 to 2027-04-01", "2027-02-01T13:00:00.000"),
-]
-
-
-@pytest.mark.parametrize(("lunar_day", "first"), RANGES)
+@pytest.mark.parametrize(("lunar_day", "first"), TABLES["ranges"])
 def test_ranges_of_time(tmp_path, lunar_day, first):
     path = write(tmp_path / "w.fits", header=HEADER | {"LUNAR_DAY": lunar_day})
     observation = read_waterfall(path).observation
@@ -212,18 +206,7 @@ def test_simulate_writes_it_and_map_reads_it(tmp_path):
     assert (tmp_path / "map" / "posterior.nc").is_file()
 
 
-NOT_WRITTEN = [
-    (["-o", "w.fits"], "at least two channels"),
-    (["-o", "w.fits", "--set", "observation.window=mean"], "hold instants"),
-    (["-o", "data.nc", "--frequencies", "10,20"], "a netCDF file contains one frequency"),
-    (["-o", "w.fits", "--frequencies", "20,10"], "expected increasing MHz"),
-    (["-o", "w.fits", "--frequencies", "ten"], "expected increasing MHz"),
-    (["-o", "w.fits", "--frequencies", "5:50:0"], "expected increasing MHz"),
-    (["-o", "w.fits", "--frequencies", "40:60:10"], "frequencies_mhz.2 is 60"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "message"), NOT_WRITTEN)
+@pytest.mark.parametrize(("arguments", "message"), TABLES["not written"])
 def test_channels_that_cannot_be_written(tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     given = ["--set", "lmax=2", "--set", "observation.runs.0.cycles=0.02", "--quiet"]

@@ -5,6 +5,7 @@ import pytest
 from assertions import refuse
 from commands import refused, run
 from experiments import flagged
+from tables import tables
 
 import lusee_bayes as lb
 from lusee_bayes.cli.options import parse_duration
@@ -12,6 +13,8 @@ from lusee_bayes.experiment.experiment import doubts
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.testing import small_scenario
+
+TABLES = tables(__file__)
 
 LMAX = 5
 MEANS = ("observation.window=mean", "observation.step_s=1800")
@@ -95,20 +98,7 @@ def test_gains_that_drift_within_samples_are_doubted(data):
         assert drift == any("Gains drift" in x for x in doubts(experiment, lb.infer(experiment)))
 
 
-BAD_INPUT = [
-    (["--to", "2hours"], "'2hours' is not a duration; give one such as 30s"),
-    (["--to", "10min"], "shorter than the samples (1800 s)"),
-    (["--to", "2h", "-o", "w.fits"], "give -o a name without .fits"),
-    (["--to", "2h", "-o", "data.nc"], "data.nc' is an input of this run"),
-    (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25 MHz"),
-    (["--to", "2h", "--set", "frequency_mhz=9", "--no-information"], "the data are at 25 MHz"),
-    (["--to", "3h", "--set", "noise.gain={correlation_h: 10}"], "average over at most 2.5 h"),
-    (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages have one frequency"),
-    (["--to", "2h", "--set", "observation.timestamp=start"], "remove that"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "words"), BAD_INPUT)
+@pytest.mark.parametrize(("arguments", "words"), TABLES["bad input"])
 def test_bad_input_is_a_sentence(path, tmp_path, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(tmp_path)
     assert words in refused(capsys, "average", path, *arguments)

@@ -18,6 +18,7 @@ from numpyro import handlers
 from reference_linear import exact_posterior
 from scipy.constants import Boltzmann, speed_of_light
 from scipy.stats import chi2, norm
+from tables import tables
 
 import lusee_bayes as lb
 from lusee_bayes.experiment import model as models
@@ -29,6 +30,8 @@ from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.systematic import Unknown
 from lusee_bayes.testing import small_scenario
+
+TABLES = tables(__file__)
 
 # Cas A is up, For A has an amplitude for every two of the six samples, and the last lies near the
 # north pole of the Moon, 24 degrees below the horizon for ever
@@ -200,16 +203,7 @@ def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
 # --- sources --------------------------------------------------------------------------------------
 
 
-UNKNOWN_SOURCES = [
-    ("Cas B", "unknown source 'Cas B' without ra_deg and dec_deg; did you mean 'Cas A'?"),
-    ("Q", "unknown source 'Q' without ra_deg and dec_deg; known: Cas A, Cen A, .*Venus"),
-    # bodies have no flux in the catalogue
-    ("Jupiter", "'Jupiter' is not in the catalogue.* give flux_jy"),
-    ("mine, ra_deg: 1, dec_deg: 2", "'mine' is not in the catalogue"),
-]
-
-
-@pytest.mark.parametrize(("source", "message"), UNKNOWN_SOURCES)
+@pytest.mark.parametrize(("source", "message"), TABLES["unknown sources"])
 def test_sources_that_are_not_known(source, message):
     refuse(message, lb.build, small_scenario(f"sources.list=[{{name: {source}}}]"))
 
@@ -217,19 +211,7 @@ def test_sources_that_are_not_known(source, message):
 # --- antennas -------------------------------------------------------------------------------------
 
 
-BAD_ANTENNAS = [
-    ("{lenght_m: 0.1}", "unknown beam parameter 'lenght_m'; did you mean 'length_m'?"),
-    ("{x: 1}", "unknown beam parameter 'x'; known: deep_permittivity, .*zenith_angle_deg"),
-    # 1 lies 2.7 / 5 standard deviations below: Phi(-0.54) = 29.5 %
-    ("{surface_permittivity: 5}", "surface_permittivity.* 29.5% .*at least 1"),
-    # Phi(-0.1) = 46 %
-    ("{loss_tangent: 0.1}", r"prior of loss_tangent, 0.01 \+- 0.1, has 46.0% .*at least 0"),
-    # 105 / 60 standard deviations to 180 degrees, 75 / 60 to 0: 10.6 % and 4.0 %
-    ("{zenith_angle_deg: 60}", r"prior of zenith_angle_deg, 75 \+- 60, has 14.6% .*at least 0"),
-]
-
-
-@pytest.mark.parametrize(("parameters", "message"), BAD_ANTENNAS)
+@pytest.mark.parametrize(("parameters", "message"), TABLES["bad antennas"])
 def test_antennas_that_cannot_be_sampled(parameters, message):
     sampled = f"noise.beam.parameters={parameters}", "noise.beam.treatment=sampled"
     for ask in (models.true_values, models.systematics):
@@ -257,15 +239,7 @@ def test_bands_beyond_the_highest_ell():
 # --- programs that do not fit the scenario --------------------------------------------------------
 
 
-COUNTED_TWICE = [
-    ("sources", [], "sources"),
-    ("gains", ["noise.gain.sigma=0.01"], "noise.gain"),
-    ("gain_scales", ["noise.gain.sigma=0.01"], "noise.gain"),
-    ("instrument", ["noise.beam.shift_mhz=4"], "noise.beam"),
-]
-
-
-@pytest.mark.parametrize(("program", "overrides", "section"), COUNTED_TWICE)
+@pytest.mark.parametrize(("program", "overrides", "section"), TABLES["counted twice"])
 def test_nothing_is_counted_twice(program, overrides, section):
     """What a program samples must not be in N as well."""
     asked, e = lb.load_program(program), experiment(*overrides, sources=CAS_A)
