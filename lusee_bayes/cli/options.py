@@ -110,10 +110,8 @@ class Options:
 
     def running(self) -> dict[str, Any]:
         """Arguments of every run."""
-        stages = Stages(
-            Console(quiet=self.quiet, soft_wrap=True, emoji=False), verbose=self.verbose
-        )
-        return {"replace": self.force, "stages": stages}
+        console = Console(quiet=self.quiet, soft_wrap=True, emoji=False)
+        return {"replace": self.force, "stages": Stages(console, verbose=self.verbose)}
 
     def print(self, *lines: object, files: Sequence[Path] = ()) -> None:
         """Print the files with --verbose, then lines and tables."""

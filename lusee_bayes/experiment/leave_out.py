@@ -241,9 +241,8 @@ def fitting(
         flagged, blamed = more
         gone, groups = gone | flagged, (*groups, *blamed)
         share = rules.count(gone) / n
-        stages.say(
-            f"  times compared at lmax={setup.scenario.lmax}, round {rounds}: {share:.2%} bad"
-        )
+        what = f"times compared at lmax={setup.scenario.lmax}, round {rounds}"
+        stages.say(f"  {what}: {share:.2%} bad")
         if not flagged.any():
             remark = " ".join(filter(None, [rules.remark(gone, groups, share), kept]))
             return Fitting(gone, remark, share)

@@ -245,9 +245,8 @@ def in_noise(
         if systematic.first_order:
             held.append(on_host(kinds.Expanded.at(systematic, before, around, later)))
         else:
-            held.append(
-                kinds.Marginalised(systematic if later is None else systematic.behind(later))
-            )
+            seen = systematic if later is None else systematic.behind(later)
+            held.append(kinds.Marginalised(seen))
     return held
 
 

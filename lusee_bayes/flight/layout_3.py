@@ -57,9 +57,8 @@ def said_in(file: Mapping[str, Any]) -> dict[str, Any]:
 
 def no_spectra(path: Path, lacking: str, names: Iterable[str]) -> InputError:
     """Return the error for a file without spectra, with a list of its contents."""
-    return InputError(
-        f"{path} has no {lacking}: it contains no spectra, but {', '.join(names) or 'nothing'}"
-    )
+    has = ", ".join(names) or "nothing"
+    return InputError(f"{path} has no {lacking}: it contains no spectra, but {has}")
 
 
 def session_of_hdf5(path: Path, file: h5py.File) -> Session:

@@ -181,9 +181,8 @@ class ComponentSums(eqx.Module):
         for (i, j), block in zip(_indices(k), self.blocks, strict=True):
             whole = linalg.mirrored(block.copy()) if i < k else block
             matrix[at[i], at[j]], matrix[at[j], at[i]] = whole, whole.T
-        return Information(
-            matrix, self.vector, self.reference, self.misfit, self.log_det, self.n_data
-        )
+        sums = self.misfit, self.log_det, self.n_data
+        return Information(matrix, self.vector, self.reference, *sums)
 
 
 def summed_information(

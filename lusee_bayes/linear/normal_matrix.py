@@ -129,9 +129,8 @@ def _rows_of_order(m: int, beams: Beams, f: Sums) -> Blocks:
     q = f[zero + m : zero + 2 * m + 1] @ others
     beam = beam.reshape(-1, beam.shape[-1]).T / 2.0
     # (rows, orders and degrees)
-    u, v = (
-        (beam @ x.reshape(m + 1, -1, n)).swapaxes(0, 1).reshape(n - m, -1) for x in (p + q, p - q)
-    )
+    seen = (beam @ x.reshape(m + 1, -1, n) for x in (p + q, p - q))
+    u, v = (x.swapaxes(0, 1).reshape(n - m, -1) for x in seen)
     return np.block([[u.real, -v.imag], [u.imag, v.real]])
 
 

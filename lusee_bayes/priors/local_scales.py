@@ -38,7 +38,7 @@ from lusee_bayes.sky.prior import PIVOT, DensePrior
 
 # arrays that recur
 Covariates = Float[np.ndarray, " covariates"]
-
+OfSizes = Float[np.ndarray, "sizes n"]
 Strengths = list[Float[np.ndarray, " _"]]
 # frequency in MHz at which the Galaxy is nearly transparent
 TRANSPARENT_MHZ = 50.0
@@ -237,7 +237,7 @@ class LocalScales(PriorFamily):
         """Number of strengths f and g_i."""
         return int(self.size_of.max(initial=0)) + 1
 
-    def summed(self, columns: Float[np.ndarray, "sized n"]) -> Float[np.ndarray, "sizes n"]:
+    def summed(self, columns: Float[np.ndarray, "sized n"]) -> OfSizes:
         """Sum over the columns of each strength."""
         return np.equal.outer(np.arange(self.n_sizes), self.size_of) @ columns
 
@@ -329,10 +329,7 @@ class LocalScalesMember(Member):
         return self._gathered(ells, sizes, fields)
 
     def _gathered(
-        self,
-        ells: Float[np.ndarray, "ells n"],
-        sizes: Float[np.ndarray, "sizes n"],
-        fields: list[np.ndarray],
+        self, ells: Float[np.ndarray, "ells n"], sizes: OfSizes, fields: list[np.ndarray]
     ) -> Float[np.ndarray, "parameters n"]:
         """Derivatives by the parameters, from those by ln C_ell, ln f^2, ln g_i^2 and v_j."""
         family = self.family

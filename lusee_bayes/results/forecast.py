@@ -88,9 +88,8 @@ def forecast_lines(forecasts: Sequence[Forecast]) -> list[str]:
     offsets = first.offsets_line()
     lines = [text, f"{source}: {offsets}"] if offsets else [text]
     if first.variation.scenario.prior.is_learned:
-        lines.append(
-            f"{source}: with the expected prior; a map, which learns it, may differ by 40 %"
-        )
+        learned = "with the expected prior; a map, which learns it, may differ by 40 %"
+        lines.append(f"{source}: {learned}")
     return lines + [
         f"{source}, {one.variation.name}: residual chi2 would not reveal errors up to these (in "
         f"brackets, the map's error in standard deviations, rms over directions): {one.unnoticed}"

@@ -252,9 +252,8 @@ def _finished(path: Path, identity: dict, sampler: Sampler) -> xr.DataTree | Non
 def _state_in_words(iteration: int, state: HMCState, sampler: Sampler) -> str:
     phase = "warmup" if iteration <= sampler.warmup else "draws"
     steps, size = float(state.num_steps.mean()), float(state.adapt_state.step_size.mean())
-    return (
-        f"{phase}, steps {steps:.0f} x {size:.3f}, acceptance {state.mean_accept_prob.mean():.2f}"
-    )
+    accepted = float(state.mean_accept_prob.mean())
+    return f"{phase}, steps {steps:.0f} x {size:.3f}, acceptance {accepted:.2f}"
 
 
 def _speed(times: list[tuple[float, int]], chains: Chains, warmup: int) -> float | None:
@@ -353,9 +352,8 @@ def run_sample(
         return replace_fields(made, result=(made.result,))
     channels = {f"{one.frequency_mhz:.15g}MHz": one for one in scenario.channels()}
     treated = registered.present(scenario)
-    together = scenario.joint or any(
-        k.octaves(one) for k, one in treated if k.treatment(scenario) == "sampled"
-    )
+    shared = (k.octaves(one) for k, one in treated if k.treatment(scenario) == "sampled")
+    together = scenario.joint or any(shared)
     with run_folder(folder, CUBES, scenario, data, program.path, **given) as run:
         drawn = draw(channels, run.path, stages) if together else [None] * len(channels)
         runs = []
@@ -476,9 +474,8 @@ def run_validate(
     with run_folder(folder, VALIDATION, scenario, data, program.path, **given) as run:
         n = sampler.chains * sampler.draws
         experiment = measured_experiment(scenario, data, stages, n_draws=n)
-        (drawn,) = sample_together(
-            {"": experiment}, program, sampler, run.path, resume=resume, stages=stages
-        )
+        alone = {"": experiment}, program, sampler, run.path
+        (drawn,) = sample_together(*alone, resume=resume, stages=stages)
         posterior, model = drawn.inference.posterior, drawn.inference.model
         with stages("comparison"):
             stats = drawn.tree["sample_stats"]

@@ -160,9 +160,8 @@ def linear_modes(fields: beam_fields.AntennaFields, lmax: int) -> tuple[Modes, M
     # df_m / dphi is m f_-m
     odd = -2.0 * weights * m * (slope - cot * polar) / sin
     azimuth = harmonics.azimuth_functions(grid.phi, lmax)
-    q, u = (
-        np.asarray(to_real(beam_fields.stokes_beam(fields, stokes))) @ azimuth for stokes in "QU"
-    )
+    patterns = (to_real(beam_fields.stokes_beam(fields, stokes)) for stokes in "QU")
+    q, u = (np.asarray(pattern) @ azimuth for pattern in patterns)
 
     def summed(pattern: Array, polar: Array, orders: Array) -> Modes:
         return np.einsum("ktc,tc->kc", pattern[..., lmax + orders], polar)

@@ -267,9 +267,8 @@ class LuseepyBeam(Described, BeamSource):
                 (w, self._received([self.e_theta[k], self.e_phi[k]], known[k], frequency_mhz, grid))
                 for k, w in self._neighbours(frequency_mhz)
             ]
-        modes = sum(
-            w * beam_fields.product_modes(fields, lmax, normalise=False) for w, fields in weighted
-        )
+        options = {"lmax": lmax, "normalise": False}
+        modes = sum(w * beam_fields.product_modes(part, **options) for w, part in weighted)
         return ProductBeams(modes, float(frequency_mhz))
 
     def interpolated(self, frequency_mhz: float) -> beam_fields.Interpolation | None:

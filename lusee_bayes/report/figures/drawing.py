@@ -55,9 +55,8 @@ def save(figures: Iterable[tuple[Path, Figure]], dpi: int) -> None:
     """
     options = {"format": "png", "dpi": dpi, "pil_kwargs": {"compress_level": COMPRESSION}}
     with ThreadPoolExecutor(1) as other:
-        written = [
-            other.submit(imsave, path, _drawn(figure, dpi), **options) for path, figure in figures
-        ]
+        drawn = ((path, _drawn(figure, dpi)) for path, figure in figures)
+        written = [other.submit(imsave, path, image, **options) for path, image in drawn]
     for one in written:
         one.result()
 
