@@ -400,9 +400,8 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
     if learned is not None and not learned.settled:
         notes.append("The prior is fixed and wide: its parameters do not converge for any noise.")
     elif learned is not None and learned.noise_factor > 1.0:
-        notes.append(
-            f"The prior, but not the map, uses N times {learned.noise_factor:.2g}, to match chi2."
-        )
+        factor = f"{learned.noise_factor:.2g}"
+        notes.append(f"The prior, but not the map, uses N times {factor}, to match chi2.")
     if learned is not None and not learned.averaged:
         notes.append("The prior has its most probable parameters, too uncertain to be averaged.")
     notes += [
@@ -418,7 +417,6 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
             "learned prior were 2 times too small at lmax 14, at most 1.4 at lmax 47: raise lmax."
         )
     if learned is not None and learned.still_moves > 0.0:
-        notes.append(
-            f"The prior did not converge: maps move by {learned.still_moves:.2g} of their errors."
-        )
+        moves = f"{learned.still_moves:.2g} of their errors"
+        notes.append(f"The prior did not converge: maps move by {moves}.")
     return (*notes, inference.unsettled) if inference.unsettled else tuple(notes)

@@ -18,7 +18,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
-from lusee_bayes.core import checks, files, reading, version
+from lusee_bayes.core import checks, files, version
+from lusee_bayes.core.reading import read_text
 from lusee_bayes.judge import chi2, convergence
 from lusee_bayes.results.finished_runs import Provenance, text_hash
 
@@ -140,7 +141,7 @@ def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any
         If the scenario is missing, and as :func:`render`.
     """
     folder = path.parent
-    scenario = reading.read_text(folder / "scenario.yaml", "a scenario")
+    scenario = read_text(folder / "scenario.yaml", "a scenario")
     return render(
         template,
         folder,

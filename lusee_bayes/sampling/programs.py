@@ -29,9 +29,10 @@ from numpyro import handlers
 from numpyro.infer import Predictive
 from numpyro.infer.util import log_density
 
-from lusee_bayes.core import files, reading
 from lusee_bayes.core.arrays import Array, on_device
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.reading import read_text, require_file
 from lusee_bayes.core.version import printable
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.sampling.distributions import Prediction
@@ -144,7 +145,7 @@ def load_program(source: str | Path) -> Program:
         If there is no such program, if it fails to load, or if it asks for an unknown argument.
     """
     path = _find(source)
-    text = reading.read_text(path, "a program in Python").encode()
+    text = read_text(path, "a program in Python").encode()
     module = ModuleType(f"lusee_bayes_program_{path.stem}")
     module.__file__ = str(path)
     # compiled from the hashed text, never from a cache of an earlier one; dataclasses look up their
@@ -178,9 +179,9 @@ def _find(source: str | Path) -> Path:
     own = {path.stem: path for folder in reversed(FOLDERS) for path in folder.glob("*.py")}
     if str(source) in own:
         return own[str(source)]
-    path, programs = files.user_path(source), ", ".join(sorted(own))
+    path, programs = user_path(source), ", ".join(sorted(own))
     if path.suffix == ".py":
-        return reading.require_file(path, "program", f"the package has {programs}")
+        return require_file(path, "program", f"the package has {programs}")
     raise InputError(f"no program '{source}': give the path of a Python file, or one of {programs}")
 
 
