@@ -53,6 +53,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
 
 
+def read_only(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The same arrays, which nobody can change: they are kept for others."""
+    for one in arrays:
+        one.setflags(write=False)
+    return arrays
+
+
 def namespace(*arrays: Any) -> ModuleType:
     """Return jax.numpy if any array, or any leaf of a tree, is a JAX array; else numpy."""
     return jnp if _of_jax(arrays) else np

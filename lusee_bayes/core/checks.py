@@ -56,6 +56,19 @@ def require_whole(name: str, value: Any, least: int, most: int) -> None:
         raise InputError(f"{name} is {value!r}, expected a whole number from {least} to {most}")
 
 
+def require_plain(name: str, array: Any) -> None:
+    """Check that an array has no unit and no mask, which NumPy would drop without a word.
+
+    Raises
+    ------
+    InputError
+        If it has.
+    """
+    for extra in ("unit", "mask"):
+        if hasattr(array, extra):
+            raise InputError(f"{name} has a {extra}; give plain numbers (units: see the docs)")
+
+
 def require_float64(name: str, array: Any) -> None:
     """Check that an array is float64; Lambda's condition number is about 1e10.
 
@@ -68,8 +81,9 @@ def require_float64(name: str, array: Any) -> None:
     Raises
     ------
     InputError
-        If it is not an array of float64.
+        If it is not an array of float64, or has a unit or a mask.
     """
+    require_plain(name, array)
     dtype = getattr(array, "dtype", None)
     if dtype != np.float64:
         got = f"an array of {dtype}" if dtype is not None else f"a {type(array).__name__}"
@@ -157,10 +171,11 @@ def require_positive(name: str, array: Any, hint: str = "") -> None:
     Raises
     ------
     InputError
-        If an entry is zero, negative or not finite.
+        If an entry is zero, negative or not finite, or has a unit.
     """
     if is_traced(array):
         return
+    require_plain(name, array)
     values = np.asarray(array)
     bad = ~(values > 0) | ~np.isfinite(values)
     if bad.any():

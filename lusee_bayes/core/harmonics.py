@@ -27,8 +27,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from lusee_bayes.core.arrays import Array, Fields, Square, namespace
-from lusee_bayes.core.checks import require_finite, require_whole
+from lusee_bayes.core.arrays import Array, Fields, Square, namespace, read_only
+from lusee_bayes.core.checks import require_finite, require_plain, require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy, rotations, special
 
@@ -70,7 +70,7 @@ def mode_numbers(lmax: int) -> tuple[np.ndarray, np.ndarray]:
     """Return ``ell`` and ``m`` of every packed mode, two integer arrays of shape (modes,)."""
     require_whole("lmax", lmax, 0, LARGEST_LMAX)
     ell = np.repeat(np.arange(lmax + 1), 2 * np.arange(lmax + 1) + 1)
-    return ell, np.arange(n_modes(lmax)) - ell * (ell + 1)
+    return read_only(ell, np.arange(n_modes(lmax)) - ell * (ell + 1))
 
 
 def from_healpy(alm: Complex[np.ndarray, "*batch alms"]) -> Float[np.ndarray, "*batch modes"]:
@@ -107,14 +107,17 @@ def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.nd
     Raises
     ------
     InputError
-        If the map has no valid NSIDE, contains NaN, or is too coarse (lmax > 3 NSIDE - 1), or if
-        lmax is negative or not an integer.
+        If the map has no valid NSIDE, a unit, a mask, NaN or UNSEEN pixels, or is too coarse
+        (lmax > 3 NSIDE - 1), or if lmax is negative or not an integer.
     """
     require_whole("lmax", lmax, 0, LARGEST_LMAX)
+    require_plain("the map", pixels)
     pixels = np.asarray(pixels, dtype=np.float64)
     if not healpy.isnpixok(pixels.size):
         raise InputError(f"{pixels.size} pixels are not a HEALPix map: expected 12 NSIDE^2")
     require_finite("the map", pixels)
+    if healpy.mask_bad(pixels).any():
+        raise InputError("the map has UNSEEN pixels, which are no temperatures; fill them first")
     nside = healpy.npix2nside(pixels.size)
     if lmax > 3 * nside - 1:
         raise InputError(
@@ -137,7 +140,7 @@ def _polar_functions(theta: tuple[float, ...], lmax: int) -> np.ndarray:
     """Y_lm at azimuth zero for every packed mode; it depends on m only through ``|m|``."""
     ell, m = mode_numbers(lmax)
     table = special.sph_legendre_p_all(lmax, lmax, np.array(theta))[0]
-    return np.ascontiguousarray(table[ell, np.abs(m)].T)
+    return read_only(np.ascontiguousarray(table[ell, np.abs(m)].T))[0]
 
 
 def polar_functions(theta: Angles, lmax: int) -> AtPoints:
@@ -251,7 +254,7 @@ def per_mode(spectrum: Float[Array, "*batch ells"]) -> Fields:
 def modes_by_size_of_order(lmax: int) -> Int[np.ndarray, " modes"]:
     """Order packed modes by ``|m|``; for each, first the a_lm, then the a_l,-m, both by ell."""
     ell, m = mode_numbers(lmax)
-    return np.lexsort((ell, m < 0, np.abs(m)))
+    return read_only(np.lexsort((ell, m < 0, np.abs(m))))[0]
 
 
 def order_products(matrix: Square, heights: Angles) -> Float[np.ndarray, "points orders orders"]:
@@ -319,7 +322,7 @@ def generators(ell: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     k_y[sine[1:], sine[1:] + 1] = -lowering[1:]
     k_x[cosine[1:], sine[1:] + 1] = lowering[1:]
     k_x[sine, cosine - 1] = -lowering
-    return k_x - k_x.T, k_y - k_y.T, k_z
+    return read_only(k_x - k_x.T, k_y - k_y.T, k_z)
 
 
 class Rotation(eqx.Module):

@@ -25,7 +25,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment import diagnosis, rounds
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
-from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.second_order import with_other_modes, with_second_order
 from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -102,7 +102,8 @@ def build(
     Parameters
     ----------
     scenario : Scenario
-        With one frequency.
+        With one frequency, or its file or name. For data without a truth it has the defaults of
+        measured data (:meth:`.Scenario.of_measured`).
     data : Visibilities, optional
         Measured data; if omitted, data are simulated from the scenario. A truth with another lmax
         is truncated, or padded with zeros.
@@ -132,11 +133,13 @@ def observed(
 
     Parameters and errors are as in :func:`build`, except that no prior has to converge.
     """
-    stages = stages or Stages()
+    scenario, stages = load_scenario(scenario), stages or Stages()
     if data is None:
         setup = set_up(scenario, stages=stages)
         with stages("noise"):
             return Experiment(setup, simulate(setup).with_truth_up_to(scenario.lmax))
+    if data.truth is None:
+        scenario = scenario.of_measured()
     doubts, above = [], scenario.noise.above_lmax
     if data.truth is not None:
         if len(data.truth) <= n_modes(scenario.lmax):  # the true sky ends at lmax

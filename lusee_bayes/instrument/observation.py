@@ -16,8 +16,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import astropy.units as u
 import numpy as np
@@ -89,6 +90,7 @@ class Observation(checks.Described):
         checks.require_finite("lon_deg and turntable_deg", [self.lon_deg, *self.turntable_deg])
         checks.require_finite("tilt_deg", self.tilt_deg)
         checks.require_shape("times", self.times, (None,))
+        object.__setattr__(self, "times", self.times.utc)
         checks.require_shape("run", self.run, self.times.shape)
         back = np.flatnonzero(~(times.seconds_from(self.times[:-1], self.times[1:]) > 0.0))
         if back.size:
@@ -128,7 +130,7 @@ class Observation(checks.Described):
         cls,
         runs: Sequence[Run] = ONE_CYCLE,
         *,
-        start: str = "2027-01-15T00:00:00",
+        start: str | datetime | Time = "2027-01-15T00:00:00",
         step_s: float = 7200.0,
         lon_deg: float = 182.258,
         lat_deg: float = -23.814,
@@ -144,7 +146,7 @@ class Observation(checks.Described):
         ----------
         runs : sequence of Run
         start : str
-            UTC, ISO.
+            UTC; a text in ISO's format, or another date.
         step_s : float
             Time from sample to sample, and integration time, in seconds.
         lon_deg, lat_deg : float
@@ -219,6 +221,7 @@ class Observation(checks.Described):
 
         A window of a schedule must be dark from start to end, a window of a run at its middle.
         """
+        require_known("unknown window", window, get_args(Window))
         times_s, length_s, live_s = np.concatenate([cut.samples_s for cut in cuts], axis=1)
         times.require_ephemeris(np.array([t0.jd + times_s[-1] / 86400.0]))
         cut_of = np.repeat(np.arange(len(cuts)), [cut.samples_s.shape[1] for cut in cuts])

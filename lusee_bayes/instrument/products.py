@@ -24,7 +24,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int, Shaped
 
-from lusee_bayes.core.arrays import Array, Grid, GridFlags, as_complex, namespace, placed
+from lusee_bayes.core.arrays import Array, Grid, GridFlags, as_complex, namespace, placed, read_only
 from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.lazy import pandas
@@ -83,7 +83,7 @@ def auto_indices(n_antennas: int = N_ANTENNAS) -> np.ndarray:
 def ports(n_antennas: int = N_ANTENNAS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the two ports of every product, and whether it is an imaginary part."""
     i, j, part = zip(*all_products(n_antennas), strict=True)
-    return np.array(i), np.array(j), np.array(part) == "I"
+    return read_only(np.array(i), np.array(j), np.array(part) == "I")
 
 
 def to_real(matrix: Hermitian) -> Products:
@@ -158,7 +158,11 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
         For names that are unknown or given twice, wrong shapes, autos that are not real,
         infinities, and an unknown convention.
     """
-    masked = np.ma.getmaskarray(data) if isinstance(data, np.ma.MaskedArray) else False
+    masked = (
+        np.ma.getmaskarray(data)
+        if isinstance(data, np.ma.MaskedArray)
+        else getattr(data, "mask", False)
+    )
     data = _numbers(data)
     require_known("unknown convention", convention, CONVENTIONS)
     ports_and_parts = _columns(products, np.iscomplexobj(data), n_antennas)

@@ -60,8 +60,8 @@ def later(times: Time, seconds: Any) -> Time:
         return times + seconds * u.s
 
 
-def time_of_text(name: str, text: str, scale: str = "utc") -> Time:
-    """Return the time of an ISO date in a time scale.
+def time_of_text(name: str, text: str | datetime | Time, scale: str = "utc") -> Time:
+    """Return the time of an ISO date, or of another, in a time scale.
 
     Raises
     ------
@@ -71,7 +71,8 @@ def time_of_text(name: str, text: str, scale: str = "utc") -> Time:
     wrong = f"{name} '{text}' is not a date; write e.g. 2027-01-15T00:00:00"
     with refusing(wrong, ValueError, TypeError), unannounced_leap_seconds():
         # astropy does not accept ISO's Z for UTC
-        time = Time(text.removesuffix("Z"), scale=scale)
+        iso = text.removesuffix("Z") if isinstance(text, str) else text
+        time = getattr(Time(iso, scale=None if isinstance(iso, Time) else scale), scale)
     require_ephemeris(np.atleast_1d(time.jd))
     return time
 

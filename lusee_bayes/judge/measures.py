@@ -30,7 +30,6 @@ from lusee_bayes.judge.coverage import latitudes, multipoles
 from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior
 
-ALL = slice(None)
 # relative rounding of a difference of two quadratic forms
 ROUNDING = 1e-10
 
@@ -225,7 +224,7 @@ def expected_chi2(posterior: Posterior, n_data: int, variance: Modes | None = No
 def highest_altitude(
     observation: Observation,
     nside: int,
-    seen: Bool[np.ndarray, " times"] | slice = ALL,
+    seen: Bool[np.ndarray, " times"] | slice = np.s_[:],
     terrain: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Pixels:
     """Compute the highest altitude that each pixel of the sky reached.

@@ -497,7 +497,6 @@ class AlikeErrors:
         told = one - half @ half.T
         mixed = np.linalg.solve(told + more + NEGLIGIBLE * one, told)
         kept = one - told + told @ mixed
-        kept = 0.5 * (kept + kept.T)
         least = np.linalg.solve(kept, mixed.T @ (lower.T @ white))
         mean = solve_lower(lower, least[:, None], transpose=True)[:, 0]
         return mean, lower @ np.linalg.cholesky(kept)

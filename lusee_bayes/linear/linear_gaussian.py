@@ -40,7 +40,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, namespace, on_host
-from lusee_bayes.core.checks import Described, is_traced, require_array
+from lusee_bayes.core.checks import Described, is_traced, require_array, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import gram_matrix, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling, as_coupling
@@ -142,8 +142,9 @@ class LinearGaussian(Described, eqx.Module):
         Raises
         ------
         InputError
-            If N is not positive definite.
+            If N is not positive definite, or the data have another shape.
         """
+        require_shape("the data", data, (self.n_data,))
         white = self.noise.factor().whiten(data - self.predict(sky))
         return namespace(white).asarray(white @ white)
 
@@ -457,8 +458,8 @@ class FromInformation(Form):
         return cls(host, factor, host.coupling, matrix, of_data.precision_root(matrix, host.prior))
 
     def condition(self, data: DataVector) -> Solution:
-        data, prior = np.asarray(data), self.model.prior
         require_array("the data", data, (self.model.n_data,))
+        data, prior = np.array(data), self.model.prior
         u, _, _ = self.about(data, np.zeros(prior.size)).white_mean(prior, self.lower, most=1)
         information = self.about(data, prior.colour(u))
         posterior = information.posterior(prior, self.lower)
@@ -514,7 +515,7 @@ class Whitened(Form):
 
     def condition(self, data: DataVector) -> Solution:
         require_array("the data", data, (self.model.n_data,))
-        data = jnp.asarray(data)
+        data = jnp.array(data)
         u, log_evidence, moved = _solve(self, data)
         if not is_traced(moved) and not float(moved) <= of_data.CONVERGENCE:
             raise InputError(

@@ -95,7 +95,8 @@ def radiometer_noise(
     layout : DataLayout
     bandwidth_hz : float
     step_s : float or (times,) array
-        Integration time in seconds: one for all samples, or the live time of each.
+        Integration time in seconds: one for all samples, or the live time of each, such as
+        :attr:`.Observation.live_s`. The default is that of :meth:`.Observation.from_runs`.
     form : {"paper", "exact"}
     duty_cycle : float
         Fraction of ``step_s`` spent integrating.

@@ -9,6 +9,7 @@ run at full speed and small enough to follow the edge of the band.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx

@@ -124,12 +124,11 @@ def describe_spectrum(path: Path) -> list[str]:
     with trees.opened_tree(path, formats.SPECTRUM, "temperatures of regions") as tree:
         cls = resolve_name("lusee_bayes.results.sky_spectrum:SkySpectrum")
         found = trees.from_tree(cls, tree, str(path))
-    first = f"temperatures of regions from {found.frequency[0]:g} to {found.frequency[-1]:g} MHz"
-    ends = zip(found.regions, found.temperature[:, 0], found.temperature[:, -1], strict=True)
-    return [first, *(f"{name}: {low:.6g} to {high:.6g} K" for name, low, high in ends)]
+    lines = [f"temperatures of regions from {found.frequency[0]:g} to {found.frequency[-1]:g} MHz"]
+    each = zip(found.regions, found.temperature, strict=True)
+    return lines + [f"{name}: {kelvin[0]:.6g} to {kelvin[-1]:.6g} K" for name, kelvin in each]
 
 
-TEXTS = {".ecsv", ".json", ".yaml", ".md", ".txt"}
 # the files that contain a verdict
 VERDICTS = ("summary.json", "priors.json")
 
@@ -204,8 +203,6 @@ def describe(path: str | Path) -> str:
         if kind in DESCRIBED:
             lines = DESCRIBED[kind](path)
         else:
-            if Path(path).suffix in TEXTS:
-                raise InputError(f"{path} is a text: read it as it is")
             lines = _cards(path) if formats.is_fits(path) else []
             if not lines or not lines[0].startswith("index"):  # which is no sky
                 reader = READERS.get(kind) or next(name for is_one, name in KINDS if is_one(path))

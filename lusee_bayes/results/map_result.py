@@ -220,12 +220,12 @@ class MapResult(Described):
         counts = [f"{name} (at {k} of {len(reports)} frequencies)" for name, k in weak.items()]
         what = f"do not constrain {', '.join(counts)}" if counts else "constrain all of them"
         lines = [f"Receivers, ground and gain table: the data {what}."]
-        apart = in_brief([f"{t.frequency_mhz:g} MHz" for t in self.shared_tests if t.disagrees])
-        but = f", except at {apart}" if apart else ""
+        apart = [f"{t.frequency_mhz:g} MHz" for t in self.shared_tests if t.disagrees]
+        where = f"all frequencies but {in_brief(apart)}" if apart else "all frequencies"
         for words, octaves in self.scenario.shared.items():
             like = "the same" if np.isinf(octaves) else f"smooth over {octaves:g} octaves"
             given = "every channel uses the constraints from all others"
-            lines.append(f"Unknowns of {words} are {like} at all frequencies{but}: {given}.")
+            lines.append(f"Unknowns of {words} are {like} at {where}: {given}.")
         nulls = {f: report.null for f, report in reports.items() if report.null is not None}
         left_open = [f for f, null in nulls.items() if null.sentence()]
         if left_open:

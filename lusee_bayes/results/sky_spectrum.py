@@ -213,7 +213,9 @@ class RegionTemperatures:
         )
 
 
-def correlation(u: Float[np.ndarray, "frequency white"]) -> Float[np.ndarray, "frequency _"]:
+def correlation_of_departures(
+    u: Float[np.ndarray, "frequency white"],
+) -> Float[np.ndarray, "frequency _"]:
     """Products of departures; noise that exceeds what correlations can be is cut off."""
     alike = np.minimum(u @ u.T, 1.0)
     np.fill_diagonal(alike, 1.0)
@@ -281,7 +283,7 @@ class SkySpectrum:
             covariance = np.einsum("frw,grw->rfg", common, common)
             if not n_draws:
                 errors = np.stack([one.error for one in departures])
-                alike = correlation(np.stack([one.mean for one in departures]))
+                alike = correlation_of_departures(np.stack([one.mean for one in departures]))
                 covariance += alike * np.einsum("frw,grw->rfg", errors, errors)
             covariance[:, *np.diag_indices(n)] = std.T**2
         # an unknown that a channel lacks takes no part in its errors

@@ -59,11 +59,12 @@ from lusee_bayes.linear import joint, positive_joint
 from lusee_bayes.linear.amplitudes import AlikeErrors, Tied, kernel, tie
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.results import sky_spectrum
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
 from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
-from lusee_bayes.results.sky_spectrum import N_DRAWS, Departure, combined, correlation
+from lusee_bayes.results.sky_spectrum import N_DRAWS, Departure, combined
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import identity_of
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -517,7 +518,8 @@ def tie_channels(
         slopes = np.zeros((*mean.shape, len(shared[0].departure)))
         for number, one in enumerate(shared):
             slopes[number, [names.index(name) for name in one.octaves]] = one.slopes
-        alike = AlikeErrors(slopes, correlation(np.stack([one.departure for one in shared])))
+        departures = np.stack([one.departure for one in shared])
+        alike = AlikeErrors(slopes, sky_spectrum.correlation_of_departures(departures))
     for number, test in enumerate(tests):
         if test.disagrees:
             kernels[:, number], kernels[:, :, number] = 0.0, 0.0

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from assertions import raising, refuse, refused
+from tables import tables
 
 import lusee_bayes
 from lusee_bayes.core import files as fs
@@ -219,15 +220,7 @@ def test_an_interrupt_while_files_are_moved_loses_nothing(folder, monkeypatch):
         assert content(folder).keys() == {*OWN, *NEW, fs.MANIFEST}
 
 
-MANIFESTS = [
-    "{", "[]", "3", '{"kind": "map"}', '{"kind": "map", "files": 3, "discard": []}', "\0",
-    '{"kind": "map", "files": [1], "discard": []}',
-    # nothing outside the folder is to be moved or removed
-    '{"kind": "map", "files": ["../own.txt"], "discard": []}',
-    '{"kind": "map", "files": [], "discard": ["/tmp"]}',
-    '{"kind": "map", "files": [], "discard": ["."]}',
-    '{"kind": "map", "files": [], "discard": [], "origin": 3}',
-]  # fmt: skip
+MANIFESTS = tables(__file__)["manifests"]
 
 
 @pytest.mark.parametrize("text", MANIFESTS)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse, within
+from astropy import units as u
 from reference import real_harmonics, sphere
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation as SpatialRotation
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 from lusee_bayes.core import harmonics as h
 from lusee_bayes.core.harmonics import from_healpy, n_modes, synthesis_matrix, to_healpy
 from lusee_bayes.core.sphere_grid import SphereGrid
+from lusee_bayes.instrument.products import ports
 
 LMAX = 9
 
@@ -84,6 +86,16 @@ def test_bad_maps_are_refused():
     refuse("100 pixels.*HEALPix map", h.map_to_modes, np.ones(100), 2)
     refuse(r"1 of 48.*\(5,\)", h.map_to_modes, np.where(np.arange(48) == 5, np.nan, 1.0), 2)
     refuse("supports lmax <= 5", h.map_to_modes, np.ones(48), 6)
+    refuse("UNSEEN", h.map_to_modes, np.where(np.arange(48) == 5, healpy.UNSEEN, 1.0), 2)
+    refuse("has a unit", h.map_to_modes, np.ones(48) << u.mK, 2)
+    refuse("has a mask", h.map_to_modes, np.ma.array(np.ones(48), mask=np.arange(48) == 5), 2)
+
+
+def test_arrays_that_all_share_cannot_be_changed():
+    shared = *h.mode_numbers(3), *ports(), *h.generators(2), h.modes_by_size_of_order(3)
+    for one in (*shared, h.polar_functions([0.3], 3)):
+        with pytest.raises(ValueError, match="read-only"):
+            one[...] = 0
     refuse("the field has shape", SphereGrid.of(3, 6).product_matrix, np.ones((3, 4)))
 
 

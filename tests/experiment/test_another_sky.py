@@ -14,6 +14,7 @@ import pytest
 import wrong_data
 from experiments import flagged
 from scipy import linalg, stats
+from tables import tables
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import lmax_of, synthesis_matrix
@@ -31,16 +32,7 @@ from lusee_bayes.systematics.gain_drifts import gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
 
 LMAX = 8
-TERMS = {
-    "radiometer": (),
-    "gain drifts": ("noise.gain={sigma: 0.01}",),
-    "beam": ("noise.beam={shift_mhz: 0.1}",),
-    "pointing": ("noise.pointing={clock_s: 60, turntable_deg: 0.1}",),
-    "receivers": ("noise.receiver={power_k: 3000}",),
-    "gain table": ("noise.gain_table={std: 0.01}",),
-    "sources": ("sky.sources=false", "sources.list=[{name: Cas A}, {name: Cyg A}]"),
-    "drifts with receivers": ("noise={gain: {sigma: 0.005}, receiver: {power_k: 3000}}",),
-}
+TERMS = tables(__file__)["terms"]
 
 
 def measured(scenario, seed, scale=1e-3):

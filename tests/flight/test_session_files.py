@@ -15,6 +15,7 @@ from assertions import assert_same, refuse
 from astropy.io import fits
 from astropy.time import Time
 from layout_4 import NAMES, RAW_S, write_families, write_layout_4
+from tables import tables
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.formats import is_session
@@ -310,15 +311,7 @@ def test_layout_4_in_fits_is_refused(tmp_path):
 # --- mission clocks: which UTC they stand for, and what contradicts them --------------------------
 
 
-RECORD = {
-    "format_version": 1,
-    "reference_event": "landing",
-    "clock_reference_isot": "2027-01-10T00:00:00",
-    "time_scale": "utc",
-    "clocks": {"spectrometer": {"clock_reference_raw_seconds": 100.0}},
-    "source": "a record",
-    "assumed": False,
-}
+RECORD = tables(__file__)["record"]
 SECONDS = np.array([100.0, 1e5, 3.0e7])
 
 

@@ -1,5 +1,8 @@
 """Times, orientations and bodies in the sky, against lunarsky, astropy and ERFA."""
 
+from dataclasses import replace
+from datetime import datetime
+
 import astropy.units as u
 import erfa
 import numpy as np
@@ -94,6 +97,14 @@ BAD_INPUT = [
     # the Sun is up for two weeks from 1 February 2027 at this site
     ({"runs": [lb.Run(0.1, night_only=True)], "start": "2027-02-05"}, "contains no lunar night"),
 ]
+
+
+def test_times_of_any_scale_and_kind_are_stored_as_utc():
+    expected = lb.Observation.from_runs(start="2027-01-15T01:00:00")
+    for start in (datetime(2027, 1, 15, 1), Time("2027-01-15T01:00:00").tdb):
+        within((lb.Observation.from_runs(start=start).times - expected.times).sec, 0.0, 1e-6)
+    moved = replace(expected, times=expected.times.tdb)
+    assert moved.times.scale == "utc" and "T01:00:00" in repr(moved)
 
 
 @pytest.mark.parametrize(("options", "message"), BAD_INPUT)

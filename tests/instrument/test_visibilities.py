@@ -9,6 +9,7 @@ import pytest
 from assertions import close, refuse, within
 from astropy import units as u
 from astropy.time import Time
+from astropy.utils.masked import Masked
 
 import lusee_bayes as lb
 from lusee_bayes.instrument import products as pr
@@ -166,7 +167,8 @@ def test_flags_nan_and_products_without_a_column_are_absent():
     made = make(data, flags=flags)
     np.testing.assert_array_equal(made.grid(), np.where(absent, np.nan, expected()))
     masked = np.ma.array(columns(PAIRS), mask=flags)
-    np.testing.assert_array_equal(np.isnan(make(masked).grid()[0]), flags[:, 0])
+    for one in (masked, Masked(columns(PAIRS), mask=flags)):
+        np.testing.assert_array_equal(np.isnan(make(one).grid()[0]), flags[:, 0])
     whole_times = np.arange(N) == 2
     np.testing.assert_array_equal(np.isnan(make(flags=whole_times).grid()).all(0), whole_times)
     autos = make(columns([(3, 3), (0, 0)]), products=["33", "00"])

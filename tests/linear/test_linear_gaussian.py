@@ -303,12 +303,23 @@ def small():
 
 
 @pytest.mark.parametrize("form", FORMS)
+def test_a_solution_keeps_its_data(small, form):
+    model, data = small[0], np.array(small[1])
+    solution, sky = model.condition(data, form), np.zeros(16)
+    chi2 = solution.chi2
+    refuse("the data has shape", model.chi2, sky, data[:1])
+    data[:] = 1e6
+    assert solution.chi2 == chi2
+
+
+@pytest.mark.parametrize("form", FORMS)
 def test_bad_data_are_refused(small, form):
     model, d = small
     for bad, message in (
         (d[:-1], r"the data has shape \(8,\), expected \(9,?\)"),
         (d.at[4].set(jnp.nan), r"the data.*NaN or infinity \(1 of 9 .*\(4,\)"),
         (d.astype(jnp.float32), r"the data must be a float64 array, got .*float32"),
+        (np.ma.array(np.asarray(d), mask=np.arange(9) == 2), "the data has a mask"),
     ):
         for ask in (lambda x: model.condition(x, form).posterior, model.log_prob):
             refuse(message, ask, bad)

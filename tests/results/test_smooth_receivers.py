@@ -18,6 +18,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import per_mode
 from lusee_bayes.experiment.model import set_up, true_values
 from lusee_bayes.report.pages import map_page
+from lusee_bayes.results import sky_spectrum
 from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs.channels import map_channels
 
@@ -50,7 +51,7 @@ def ties(frequencies) -> np.ndarray:
 def independent():
     """Skies as independent as the oracle's; test_shared_instrument.py has those that are alike."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(channels, "correlation", lambda u: np.eye(len(u)))
+        patch.setattr(sky_spectrum, "correlation_of_departures", lambda u: np.eye(len(u)))
         yield
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from assertions import refuse
 from scipy.integrate import quad
+from tables import tables
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map, synthesis_matrix
@@ -290,17 +291,7 @@ def test_frequencies_are_positive(bad):
     refuse("must be positive", SOURCES["Cyg A"].flux_jy, bad)
 
 
-POSITIONS = [
-    ("Cas A", 111.7, -2.1),  # SNR G111.7-2.1 (Green's catalogue)
-    ("Tau A", 184.6, -5.8),  # SNR G184.6-5.8
-    ("Cyg A", 76.19, 5.76),  # SIMBAD, as are those below
-    ("Vir A", 283.78, 74.49),
-    ("Cen A", 309.52, 19.42),
-    ("For A", 240.16, -56.69),
-    ("Her A", 23.05, 28.95),
-    ("Hyd A", 242.93, 25.09),
-    ("Pic A", 251.60, -34.63),
-]
+POSITIONS = tables(__file__)["positions"]
 
 
 @pytest.mark.parametrize("name, lon_deg, lat_deg", POSITIONS)

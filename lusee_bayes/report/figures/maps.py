@@ -97,9 +97,10 @@ def plot_map(sky: MapResult | Posterior | arrays.Modes, nside: int = 64) -> Figu
 
     Parameters
     ----------
-    sky : MapResult, Posterior or (modes,) array
-        Real harmonic coefficients, Galactic, in K. For a result (``lb.run_map(...).result``), the
-        first channel is drawn, with truth and residual if known, and the region that never rises.
+    sky : MapResult, Posterior, Sky or (modes,) array
+        Real harmonic coefficients, Galactic, in K, drawn through the beam that the title states.
+        For a result (``lb.run_map(...).result``), the first channel is drawn, with truth and
+        residual if known, and the region that never rises.
     nside : int
         HEALPix resolution of the drawn map; a result has its own.
 
@@ -110,11 +111,14 @@ def plot_map(sky: MapResult | Posterior | arrays.Modes, nside: int = 64) -> Figu
     """
     if isinstance(sky, MapResult):
         return channel_map(sky.channel)
-    pixels = drawing.shown(np.asarray(sky.mean if isinstance(sky, Posterior) else sky), nside)
-    panels = {"sky": (pixels, drawing.temperatures(pixels))}
+    modes = sky.mean if isinstance(sky, Posterior) else getattr(sky, "modes", sky)
+    pixels = drawing.shown(np.asarray(modes), nside)
+    width = harmonics.taper_fwhm_deg(max(harmonics.lmax_of(len(modes)), 1))
+    title = f"smoothed with a beam of {width:.1f}° (FWHM)"
+    panels = {f"sky, {title}": (pixels, drawing.temperatures(pixels))}
     if isinstance(sky, Posterior):
         std = pixel_std(np.asarray(sky.covariance()), nside)
-        panels = {"posterior mean": panels["sky"]}
+        panels = {f"posterior mean, {title}": panels[f"sky, {title}"]}
         panels["posterior standard deviation"] = std, LogNorm(*np.percentile(std, [0.5, 99.5]))
     figure, places = drawing.framed((6 * len(panels), 3.6), 1, len(panels), squeeze=False)
     for axes, (title, panel) in zip(places[0], panels.items(), strict=True):
