@@ -1,7 +1,5 @@
 """The paper's cases: their scenarios, and the quantities that figures and claims need."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ A claim's judge computes a result from the cases, and decides whether it agrees:
 by the two conditions given to :func:`grade`. All numbers are computed here from the cases.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

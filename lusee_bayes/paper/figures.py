@@ -1,7 +1,5 @@
 """Figures with the content of the paper's figures 2 to 9, drawn from the computed cases."""
 
-from __future__ import annotations
-
 import numpy as np
 import xarray as xr
 from jaxtyping import Float

@@ -1,7 +1,5 @@
 """Reproduction of the reference paper: cases computed once, then figures and tested claims."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -147,8 +147,7 @@ class PointSources(Systematic):
         columns, unknowns = [], []
         for one, response in zip(section.list, setup.responses, strict=True):
             flux = np.float64(one.mean_flux(setup.frequency_mhz))
-            block = one.blocks(setup.observation)
-            n_blocks = int(block.max()) + 1
+            n_blocks = int((block := one.blocks(setup.observation)).max()) + 1
             for number in range(n_blocks):
                 columns.append(setup.layout.gather(np.where(block == number, response, 0.0)))
             site, size = f"flux_{one.name.replace(' ', '_')}", None if n_blocks == 1 else n_blocks

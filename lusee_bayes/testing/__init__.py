@@ -4,8 +4,6 @@ There is one check for each protocol: covariances, beam sources, coupling matric
 sources of skies. Bad input must be refused in a sentence. Extensions use them, too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

@@ -337,5 +337,4 @@ def shown(modes: Float[np.ndarray, " modes"], nside: int, lmax: int | None = Non
     ``lmax`` is that of the map to which the beam belongs, by default that of the coefficients.
     """
     top = lmax_of(len(modes))
-    beam = taper(top if lmax is None else lmax, top)
-    return modes_to_map(modes * per_mode(beam), nside)
+    return modes_to_map(modes * per_mode(taper(top if lmax is None else lmax, top)), nside)

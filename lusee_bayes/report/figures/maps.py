@@ -114,11 +114,10 @@ def plot_map(sky: MapResult | Posterior | arrays.Modes, nside: int = 64) -> Figu
     modes = sky.mean if isinstance(sky, Posterior) else getattr(sky, "modes", sky)
     pixels = drawing.shown(np.asarray(modes), nside)
     width = harmonics.taper_fwhm_deg(max(harmonics.lmax_of(len(modes)), 1))
-    title = f"smoothed with a beam of {width:.1f}° (FWHM)"
-    panels = {f"sky, {title}": (pixels, drawing.temperatures(pixels))}
+    name = "posterior mean" if isinstance(sky, Posterior) else "sky"
+    panels = {f"{name}, beam {width:.1f}° (FWHM)": (pixels, drawing.temperatures(pixels))}
     if isinstance(sky, Posterior):
         std = pixel_std(np.asarray(sky.covariance()), nside)
-        panels = {f"posterior mean, {title}": panels[f"sky, {title}"]}
         panels["posterior standard deviation"] = std, LogNorm(*np.percentile(std, [0.5, 99.5]))
     figure, places = drawing.framed((6 * len(panels), 3.6), 1, len(panels), squeeze=False)
     for axes, (title, panel) in zip(places[0], panels.items(), strict=True):
