@@ -93,7 +93,7 @@ def test_bad_maps_are_refused():
 
 def test_arrays_that_all_share_cannot_be_changed():
     shared = *h.mode_numbers(3), *ports(), *h.generators(2), h.modes_by_size_of_order(3)
-    for one in (*shared, h.polar_functions([0.3], 3)):
+    for one in (*shared, h.polar_functions(np.array([0.3]), 3)):
         with pytest.raises(ValueError, match="read-only"):
             one[...] = 0
     refuse("the field has shape", SphereGrid.of(3, 6).product_matrix, np.ones((3, 4)))

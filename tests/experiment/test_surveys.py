@@ -42,7 +42,8 @@ def survey_of(sky, path, unseen=False):
 def mapped(data, *surveys):
     """The inference with these surveys, and its squared distance from the truth per mode."""
     given = f"prior={{model: local_scales, surveys: [{', '.join(surveys)}]}}"
-    experiment = lb.build(wrong_data.changed(wrong_data.scenario(LMAX, ABOVE), given), data)
+    scenario = wrong_data.scenario(LMAX, ABOVE, "beam.exact=true", given)
+    experiment = lb.build(scenario, data)
     found = lb.infer(experiment)
     off = sky_of(2).modes[: n_modes(LMAX)] - found.posterior.mean
     distance = float(off @ np.linalg.solve(found.solution.covariance, off)) / len(off)
