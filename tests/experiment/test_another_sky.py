@@ -214,7 +214,7 @@ def sky(lmax):
 
 def diagnosed(wrong, scenario=None):
     scenario = scenario or wrong_data.scenario(LMAX)
-    data = replace(wrong.make(scenario, sky(scenario.lmax), 1), truth=None)
+    data = wrong.make(scenario, sky(scenario.lmax), 1).with_truth_up_to(scenario.lmax + 1)
     experiment = lb.build(scenario, data)
     found = lb.infer(experiment)
     left = residuals(found.solution, data)
@@ -357,7 +357,7 @@ def test_all_wrong_data_make_a_map_and_most_causes_are_named():
         left, found = diagnosed(wrong)
         assert left.level() == "does not fit", wrong.name
         assert not any(proposal.explains for proposal in found.proposals), wrong.name
-        assert found.proposals or "The model has no noise.fields, noise." in found.sentences()[0]
+        assert found.proposals or "The model has no noise.beam, noise." in found.sentences()[0]
 
 
 @pytest.mark.long

@@ -263,11 +263,11 @@ def scenario_of(flight, *changes):
         "lmax=32",
         "observation={timestamp: instant}",
         f"beam={{model: response, file: {luseepy / 'synthetic_response_v3.fits'}, receiver: jfet, "
-        "moon_temperature_k: 250.0}",
+        "moon_temperature_k: 250.0, exact: true}",
         f"sky={{model: file, file: {luseepy / 'sky_alm.npz'}}}",
         "prior={model: isotropic, spectrum: sky}",
         "noise={radiometer: {form: exact, temperature: measured}, "
-        "receiver: {power_v2_hz: 4.0e-20, relative_std: 0.1}}",
+        "receiver: {power_v2_hz: 4.0e-20, relative_std: 0.1}, above_lmax: {treatment: ignored}}",
         f"flight={{gain_table: {flight / 'gain'}, bin_origin: centre}}",
     ]
     return lb.load_scenario("fiducial", [*given, *changes])
