@@ -66,7 +66,7 @@ def require_plain(name: str, array: Any) -> None:
     """
     for extra in ("unit", "mask"):
         if hasattr(array, extra):
-            raise InputError(f"{name} has a {extra}; give plain numbers (units: see the docs)")
+            raise InputError(f"{name} has a {extra}; give plain numbers in the documented unit")
 
 
 def require_float64(name: str, array: Any) -> None:

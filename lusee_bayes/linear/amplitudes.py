@@ -498,8 +498,7 @@ class AlikeErrors:
         mixed = np.linalg.solve(told + more + NEGLIGIBLE * one, told)
         kept = one - told + told @ mixed
         least = np.linalg.solve(kept, mixed.T @ (lower.T @ white))
-        mean = solve_lower(lower, least[:, None], transpose=True)[:, 0]
-        return mean, lower @ np.linalg.cholesky(kept)
+        return np.linalg.solve(lower.T, least), lower @ np.linalg.cholesky(kept)
 
 
 def tie(

@@ -74,6 +74,7 @@ class GainDrift(eqx.Module):
     correlation_h: Float[Array, ""] = eqx.field(default=10.0, converter=scalar)
 
     def __check_init__(self):
+        checks.require_shape("the gain drift's sigma", self.sigma, ())
         checks.require_positive("the gain drift's sigma", self.sigma)
         checks.require_positive("the gain drift's correlation time in hours", self.correlation_h)
 

@@ -93,8 +93,7 @@ def write_index_maps(result: MapResult, folder: Path) -> None:
     units, found = {"turnover": "MHz", "turnover_std": "MHz"}, result.index_maps()
     columns = [(name, pixels, units.get(name, "")) for name, pixels in found.maps.items()]
     more = {"FREQREF": (found.reference_mhz, "frequency of the index in MHz")}
-    fwhm_deg = harmonics.taper_fwhm_deg(result.scenario.lmax)
-    more["FWHM"] = (fwhm_deg, "of the beam that smooths the skies, in degrees")
+    more["FWHM"] = harmonics.taper_fwhm_deg(result.scenario.lmax), "smoothing beam in degrees"
     _write_columns(folder / "index.fits", columns, cards("index", result.scenario) | more)
 
 
