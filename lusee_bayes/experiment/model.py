@@ -192,8 +192,12 @@ def moved(setup: Setup, values: kinds.Truth | None, *, above: bool = False) -> S
     return made.with_signal()
 
 
-def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, kinds.Systematic]]:
+def systematics(
+    setup: Setup, around: Around | None = None, *, moving: bool = True
+) -> list[tuple[str, kinds.Systematic]]:
     """Treatment and systematic, for all that the scenario does not ignore, in order.
+
+    Without ``moving``, those whose values are found in rounds are left out.
 
     If the instrument is expanded around values, such as clock and pointing offsets, all systematics
     are: gains and sources then belong to the corrected pointing.
@@ -204,7 +208,7 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, k
     return [
         (treatment, cls.build(section, placed, around))
         for cls, section in registered.present(setup.scenario)
-        if (treatment := cls.treatment(setup.scenario)) != "ignored"
+        if (treatment := cls.treatment(setup.scenario)) != "ignored" and (moving or not cls.moves)
     ]
 
 
@@ -263,8 +267,8 @@ def model_about(
     moving : bool
         Include systematics whose values are found in rounds.
     """
-    model, parts = base_model(setup, around), (s for _, s in systematics(setup, around))
-    held = in_noise(setup, model, (s for s in parts if moving or not s.moves), around)
+    model, parts = base_model(setup, around), systematics(setup, around, moving=moving)
+    held = in_noise(setup, model, (systematic for _, systematic in parts), around)
     for systematic in held:
         model = systematic.marginalised(model)
     return model, tuple(held)

@@ -164,12 +164,12 @@ class AmplitudesOfSky:
         """
         model, t, factor = solution.model, np.asarray(templates), solution.factor
         if isinstance(factor, LowRankFactor):
-            root = np.asarray(model.noise.update.root)
+            rows = np.ascontiguousarray(np.asarray(model.noise.update.root).T)
             at: list[int] = []
-            for column in t.T:  # two may be alike
-                alike = np.flatnonzero((root[:FEW] == column[:FEW, None]).all(0)).tolist()
-                at.append(next(k for k in alike if k not in at and (root[:, k] == column).all()))
-            left = cho_solve((np.asarray(factor.lower), True), np.eye(root.shape[1])[:, at])
+            for row in np.ascontiguousarray(t.T):  # two may be alike
+                alike = np.flatnonzero((rows[:, :FEW] == row[:FEW]).all(1)).tolist()
+                at.append(next(k for k in alike if k not in at and (rows[k] == row).all()))
+            left = cho_solve((np.asarray(factor.lower), True), np.eye(len(rows))[:, at])
             half = factor.v @ left
             solved, covariance = factor.base.whiten_transpose(half), left[at]
             residual = solution.data - model.predict(solution.posterior.mean)

@@ -41,6 +41,8 @@ from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values
 
 # name of the learned parameter
 STD = "field_std"
+# unknowns at ell 0, all together or with a number
+FIRST = "field_error_0"
 # largest standard deviation in any direction
 LARGEST = 0.1
 
@@ -129,10 +131,10 @@ class FieldErrors(ChangedBeams):
     @classmethod
     def moved(cls, section: FieldErrorsSection, setup: Setup, values: Values) -> Setup:
         """Use beams with these errors."""
-        errors = cls.build(section, setup, Around(values=values))
-        if not any(name in values for name in (errors.names[0], errors.unknowns[0].name)):
+        if not (one_by_one := f"{FIRST}_0" in values) and FIRST not in values:
             return setup
-        if errors.names[0] in values:
+        errors = cls.build(section, setup, Around(values=values))
+        if one_by_one:
             values = errors.values(errors.centre(values))
         modes = errors.modes(np.asarray(setup.beams.modes), values)
         beams = replace(setup.beams, modes=modes)

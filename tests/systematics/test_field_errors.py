@@ -105,7 +105,7 @@ def test_the_strength_becomes_that_of_the_largest_evidence():
     assert errors.relearned(0.0 * seen, 1e-3 * variance)[STD] == section.std
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_maps_beside_errors_of_the_fields(seed):
     """Sky and errors of twenty times the expected strength: the map is off by what it says.
 
