@@ -30,6 +30,7 @@ from scipy.linalg import block_diag
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, Square, Vector
 from lusee_bayes.core.checks import with_error
+from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, true_values
@@ -37,10 +38,10 @@ from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
 from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, Shared, Tied
-from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.sky.galaxy import kelvin_steradian
 from lusee_bayes.systematics import context, gain_table
+from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 from lusee_bayes.systematics.sources import PointSources
 from lusee_bayes.systematics.systematic import Expanded, Truth
@@ -226,7 +227,7 @@ class Fluxes:
     """Posterior of point sources, each as the mean temperature that it adds to the sky, in K.
 
     names : of the sources; truth : NaN if unknown; with_sky : covariance with the sky, in K^2;
-    with_all : covariance of the sky, and of the sources, with all unknowns, in K
+    with_all : covariance of the sky, and of the sources, with all amplitudes, in K
     """
 
     names: tuple[str, ...]
@@ -329,39 +330,11 @@ class Unknowns:
         """Indices of the shared unknowns in ``tied``."""
         return [tied.names.index(name) for name in self.shared_names]
 
-    def _of(self, tied: Tied, number: int) -> Shared:
-        k, given, root = self.shared, self.amplitudes, tied.prior_root[number, self.among(tied)]
-        covariance = given.covariance[np.ix_(k, k)]
-        return Shared(k, given.mean[k] + self.expected[k], given.pull[k], covariance, root)
-
-    def whole(self, information: Information, tied: Tied, number: int) -> Information:
-        """The data's information about the sky together with the shared unknowns.
-
-        Parameters
-        ----------
-        information : Information
-            About the sky, with the unknowns in N.
-        tied : Tied
-            Prior of the shared unknowns.
-        number : int
-            Index of the channel in ``tied``.
-        """
-        return self._of(tied, number).information(information, self.amplitudes.reference)
-
-    def given_all(self, tied: Tied, number: int, mean: Vector, covariance: Square) -> Unknowns:
-        """Return the unknowns given all data of a joint posterior.
-
-        Parameters
-        ----------
-        tied : Tied
-            Prior of the shared unknowns.
-        number : int
-            Index of the channel in ``tied``.
-        mean, covariance : (modes + w,) and square array
-            Posterior of the sky and w, in K and K^2.
-        """
-        amplitudes = self.amplitudes.with_shared(self._of(tied, number), mean, covariance)
-        return replace(self, amplitudes=amplitudes)
+    def given_all(self, amplitudes: Amplitudes) -> Unknowns:
+        """Return the unknowns given all data of a joint posterior."""
+        n = len(self.rows)
+        inner = amplitudes.mean[:n], amplitudes.covariance[:n, :n], amplitudes.with_sky[:, :n]
+        return replace(self, amplitudes=Amplitudes(*inner))
 
     def table(self, mean: Modes, covariance: ModesMatrix) -> pd.DataFrame:
         """All unknowns with value and std, sky integrated out; parameters as in :meth:`report`."""
@@ -455,6 +428,63 @@ class Unknowns:
         return NullDirection.of((SKY, *self.names), blocks)
 
 
+@dataclass(frozen=True)
+class SkyAbove:
+    """The sky above lmax that a channel's data see, and the unknowns, given the sky of the map.
+
+    Attributes
+    ----------
+    directions : (others, few) array
+        Orthonormal directions of its departure from the prior, in prior standard deviations.
+    amplitudes : AmplitudesOfSky
+        Of all unknowns, and then along these directions.
+    """
+
+    directions: Float[np.ndarray, "above few"]
+    amplitudes: AmplitudesOfSky
+
+    @classmethod
+    def of(cls, setup: context.Setup, inference: Inference) -> SkyAbove | None:
+        """Find it in a solved model; None if that ends at lmax."""
+        parts = [part.systematic for part in inference.systematics]
+        roots = [part.root for part in parts if isinstance(part, AboveLmax)]
+        if not roots:
+            return None
+        lower = checked_cholesky("the prior above lmax", setup.above.covariance)
+        directions = solve_lower(lower, setup.above.root[setup.prior.size :], transpose=False)
+        columns = np.concatenate([*(part.columns for part in inference.expanded), *roots], axis=1)
+        return cls(directions, AmplitudesOfSky.of(inference.solution, columns))
+
+
+def in_common(unknowns: Unknowns | None, above: SkyAbove | None, tied: Tied, number: int) -> Shared:
+    """What a channel has in common with the others of a joint posterior, given its sky.
+
+    Parameters
+    ----------
+    unknowns : Unknowns or None
+    above : SkyAbove or None
+        If ``tied`` has the sky above lmax.
+    tied : Tied
+        Prior of the common unknowns.
+    number : int
+        Index of the channel in ``tied``.
+    """
+    given = unknowns.amplitudes if above is None else above.amplitudes
+    mean, turn, root = given.mean.copy(), np.zeros((len(given.mean), 0)), np.zeros((0, 0))
+    if unknowns is not None:
+        mean[: len(unknowns.expected)] += unknowns.expected
+        turn = np.eye(len(mean))[:, unknowns.shared]
+        root = tied.prior_root[number, unknowns.among(tied)]
+    if tied.above is not None:
+        alike = tied.above.strengths[number] * above.directions.T @ tied.above.directions
+        turn = np.hstack([turn, np.pad(alike, ((len(mean) - len(alike), 0), (0, 0)))])
+        root = block_diag(root, np.eye(alike.shape[1]))
+    across = given.covariance @ turn
+    spread = turn.T @ across + np.eye(turn.shape[1]) - turn.T @ turn
+    pull, reference = turn.T @ given.pull, given.reference
+    return Shared(across, turn.T @ mean, pull, spread, root, reference)
+
+
 def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
     """The unknowns of systematics with their priors.
 
@@ -490,9 +520,10 @@ def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
 
 
 def given_data(table: pd.DataFrame, amplitudes: Amplitudes) -> pd.DataFrame:
-    """Add value and std to a table, from amplitudes in prior standard deviations."""
-    value = table["expected"] + table["prior_std"] * amplitudes.mean
-    return table.assign(value=value, std=table["prior_std"] * amplitudes.std)
+    """Add value and std to a table, from amplitudes in prior standard deviations (its own first)."""
+    mean, std = amplitudes.mean[: len(table)], amplitudes.std[: len(table)]
+    value = table["expected"] + table["prior_std"] * mean
+    return table.assign(value=value, std=table["prior_std"] * std)
 
 
 def _alone(experiment: Experiment, inference: Inference, part: Expanded) -> pd.DataFrame:

@@ -62,20 +62,29 @@ the sky give ln p(d | m, w) = ln p(d | m) + ln p(z | m, d) - ln N(z; 0, 1), i.e.
 
     ( M + P^T D^-1 P    P^T D^-1 R       )        ( v                 )
     ( R^T D^-1 P        R^T (D^-1 - 1) R ),       ( R^T R w0          )    about m0, R w0 = y + e.
+
+*The sky above lmax* is nearly the same in all channels, too. Its departure x_k from the prior, in
+prior standard deviations, is seen along orthonormal directions D_k, as templates with amplitudes
+D_k^T x_k. With x_k = s_k x + (what differs by channel), x ~ N(0, 1), and w = Q^T x along directions
+Q that are the same for all, N(E, V) for the amplitudes becomes ::
+
+    N(R_k^T E, 1 - R_k^T (1 - V) R_k)  for w,    R_k = s_k D_k^T Q.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.linalg import cho_solve
 
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Square, Vector
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import Solution
@@ -199,11 +208,11 @@ class AmplitudesOfSky:
             In K and K^2.
         """
         n = len(self.reference)
-        slope = np.linalg.solve(shared.covariance, self.covariance[shared.index]).T
+        slope = np.linalg.solve(shared.covariance, shared.across.T).T
         reach = np.concatenate([slope @ shared.pull - self.pull, slope @ shared.root], axis=1)
         off = np.concatenate([mean[:n] - self.reference, mean[n:]])
         least = self.mean - slope @ shared.mean + reach @ off
-        left = self.covariance - slope @ self.covariance[shared.index]
+        left = self.covariance - slope @ shared.across.T
         with_all = covariance @ reach.T
         return Amplitudes(least, left + reach @ with_all, with_all[:n])
 
@@ -259,25 +268,20 @@ class AmplitudesOfSky:
 class Shared:
     """Posterior of a channel's z = R w given its sky, with the mean for the sky m0.
 
-    index : places among the channel's amplitudes; mean : y + e; pull : P; covariance : D; root : R
+    across : covariance of the channel's amplitudes with z; mean : y + e; pull : P; covariance : D;
+    root : R; reference : m0, in K
     """
 
-    index: Int[np.ndarray, " shared"]
+    across: Float[np.ndarray, "amplitudes shared"]
     mean: Vector
     pull: Float[np.ndarray, "shared modes"]
     covariance: Square
     root: Float[np.ndarray, "shared w"]
+    reference: Modes
 
-    def information(self, information: Information, sky: Modes) -> Information:
-        """Compute the information about the sky and w together.
-
-        Parameters
-        ----------
-        information : Information
-            Of the sky.
-        sky : (modes,) array
-            m0, in K.
-        """
+    def information(self, information: Information) -> Information:
+        """Compute the information about the sky and w together, from that about the sky."""
+        sky = self.reference
         local, inverse = information.recentred(sky), np.linalg.inv(self.covariance)
         at = np.linalg.lstsq(self.root, self.mean, rcond=None)[0]
         weight, pulled = self.root.T @ inverse, self.pull.T @ inverse
@@ -402,6 +406,44 @@ class Patterns(eqx.Module):
 REFINEMENTS = 2
 
 
+# common directions of the sky above lmax are those that this share of a channel's or more has
+LEAST_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class AlikeAbove:
+    """What channels have in common of the sky above lmax.
+
+    Attributes
+    ----------
+    directions : (others, few) array
+        Q.
+    strengths : (channels,) array
+        s_k.
+    """
+
+    directions: Float[np.ndarray, "others few"]
+    strengths: Float[np.ndarray, " channels"]
+
+    @classmethod
+    def of(
+        cls,
+        directions: Sequence[Float[np.ndarray, "others _"]],
+        skies: Float[np.ndarray, "channels modes"],
+    ) -> AlikeAbove:
+        """Find it from some channels' D_k, and from model skies, whose small scales tell s_k."""
+        every = np.concatenate(directions, axis=1)
+        shares, axes = np.linalg.eigh(every.T @ every)
+        kept = shares > LEAST_SHARE
+        small = skies[:, n_modes(lmax_of(skies.shape[1]) // 2) :]
+        lengths = np.linalg.norm(small, axis=1, keepdims=True)
+        alike = np.full(small.shape, small.shape[1] ** -0.5)
+        alike = np.divide(small, lengths, out=alike, where=lengths > 0)
+        variances, vectors = np.linalg.eigh(alike @ alike.T)
+        strengths = np.abs(vectors[:, -1]) * np.sqrt(variances[-1])
+        return cls(every @ (axes[:, kept] / np.sqrt(shares[kept])), strengths)
+
+
 @dataclass(frozen=True)
 class Tied:
     """Posterior of amplitudes given the data of all channels.
@@ -422,6 +464,8 @@ class Tied:
         are independent.
     names : tuple of str
         Of the amplitudes, if they have names.
+    above : AlikeAbove or None
+        The sky above lmax, as another common unknown of a joint posterior.
     """
 
     mean: Float[np.ndarray, "channels n"]
@@ -431,6 +475,19 @@ class Tied:
     draws: Float[np.ndarray, "draws channels n"]
     log_evidence: float
     names: tuple[str, ...] = ()
+    above: AlikeAbove | None = None
+
+    @classmethod
+    def of_nothing(cls, n_channels: int) -> Tied:
+        """Of channels without common amplitudes."""
+        none = np.zeros((n_channels, 0))
+        return cls(none, none[..., None], none[0], none[..., None], none[None], 0.0)
+
+    @property
+    def start(self) -> Vector:
+        """Values of all common unknowns before channels have common skies."""
+        n = 0 if self.above is None else self.above.directions.shape[1]
+        return np.concatenate([self.white, np.zeros(n)])
 
     @property
     def covariance(self) -> Float[np.ndarray, "channels n n"]:

@@ -25,7 +25,7 @@ from lusee_bayes.core.linalg import mirrored, scaled, solve_lower
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment import diagnosis, rounds, validity
 from lusee_bayes.experiment.experiment import Experiment, doubts, infer, posterior_draws, rounds_of
-from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
+from lusee_bayes.experiment.unknowns import SkyAbove, Unknowns, flux_table, pointing_report
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge import coverage, measures
 from lusee_bayes.judge.plausibility import about_information
@@ -177,6 +177,11 @@ class Conditioned:
     def unknowns(self) -> Unknowns | None:
         """Receivers, ground and gain table given the sky, from these data alone."""
         return Unknowns.of(self.experiment, self.from_data)
+
+    @cached_property
+    def above(self) -> SkyAbove | None:
+        """The sky above lmax given the sky; None if the model ends there, or of earlier data."""
+        return None if self.onto else SkyAbove.of(self.experiment.setup, self.from_data)
 
     @cached_property
     def expected(self) -> float:
@@ -353,15 +358,23 @@ class Conditioned:
                 return None if other.level() == "does not fit" else other
         return None
 
-    def _shared(self) -> tuple[WithSky, Columns]:
-        """Covariance and w of :class:`.Departure`, in K^2 and K."""
-        if self.unknowns is None:
-            return self.covariance, np.zeros((len(self.covariance), 0))
-        given = self.unknowns.amplitudes.integrated(self.posterior.mean, self.covariance)
-        shared, fluxes = self.unknowns.shared, self.unknowns.fluxes(given)
+    def _shared(self) -> tuple[WithSky, Columns, Columns]:
+        """Covariance, w and above of :class:`.Departure`, in K^2 and K."""
+        unknowns, above, sources, n = self.unknowns, self.above, self.covariance[:0], 0
+        shared, none = np.zeros(0, dtype=int), np.zeros((len(self.covariance), 0))
+        if unknowns is None and above is None:
+            return self.covariance, none, none
+        amplitudes = unknowns.amplitudes if above is None else above.amplitudes
+        given = amplitudes.integrated(self.posterior.mean, self.covariance)
+        with_all = given.with_sky
+        if unknowns is not None:
+            fluxes, shared, n = unknowns.fluxes(given), unknowns.shared, len(unknowns.rows)
+            sources, with_all = fluxes.with_sky, fluxes.with_all
         lower = np.linalg.cholesky(given.covariance[np.ix_(shared, shared)])
-        w = solve_lower(lower, fluxes.with_all[:, shared].T, transpose=False).T
-        return np.concatenate([self.covariance, fluxes.with_sky]), w
+        both = np.concatenate([with_all, given.covariance[n:]])[:, shared]
+        w, inner = np.split(solve_lower(lower, both.T, transpose=False).T, [len(with_all)])
+        beyond = none if above is None else (with_all[:, n:] - w @ inner.T) @ above.directions.T
+        return np.concatenate([self.covariance, sources]), w, beyond
 
     def _judged(self, misfit: Residuals, *, truncated: bool) -> Judged:
         """Describe the residuals, with the verdict in words."""

@@ -1,9 +1,9 @@
 """The spectrum of the sky: temperatures of regions at every frequency, with their covariance.
 
 The temperature of a region is the mean over its pixels, T = L m for a sky m, with the variance
-L C L^T in each channel. Two channels have two kinds of errors in common, ::
+L C L^T in each channel. Two channels have three kinds of errors in common, ::
 
-    Cov(T_f, T_g) = (L W_f) (L W_g)^T + rho_fg (L E_f) (L E_g)^T,    f != g.
+    Cov(T_f, T_g) = (L W_f) (L W_g)^T + rho_fg [(L E_f) (L E_g)^T + (L F_f) (L F_g)^T],    f != g.
 
 The instrument that they share, z_f = R_f w with the posterior w ~ N(.., 1), moves the sky m_f by
 W_f = Cov(m_f, z_f) Cov(z_f)^-1 R_f per unit of w.
@@ -12,8 +12,10 @@ Channels are solved with independent priors m = mu + G u, u ~ N(0, 1), but their
 Given z, with the covariance C_z, the error of m contains -E u with E = C_z G^-T: the structure that
 the data do not measure, which is nearly the same at all frequencies. rho_fg, the correlation of u
 at f and g, is measured: it is the product of the posterior means u', each divided by the root of
-u' K u', with the fraction K = 1 - G^-1 C G^-T that the data measure. Both terms are at most the
-whole variance, so the matrix is positive definite.
+u' K u', with the fraction K = 1 - G^-1 C G^-T that the data measure. The sky above lmax, x ~ N(0, 1)
+in prior standard deviations, is taken for structure of the map: the error contains -F x, where F is
+the covariance of m with x given z. Together these are at most the whole variance, so the matrix is
+positive definite.
 
 In a joint posterior the prior correlates the skies. L m_f is linear in the component maps and the
 shared unknowns x, with the slope W_f (:func:`.joint.sky_slopes`), and the rest is independent of
@@ -56,6 +58,7 @@ NSIDE = 64
 REGIONS = "mean sky", "observed sky", "cap b > 60", "cap b < -60", "plane |b| < 10"
 OBSERVED = REGIONS[1]
 UNOBSERVED, UNMEASURED = "unobserved sky", "unmeasured structure"
+ABOVE_LMAX = "sky above lmax"
 # draws of a joint posterior, from which covariances of positive skies are computed
 N_DRAWS = 400
 TINY = np.finfo(np.float64).tiny
@@ -91,14 +94,22 @@ class Departure:
         that products of two channels are the correlation of their skies.
     error : (regions + sources, white) array
         L E: how each region's temperature misses u, and the temperature of each point source.
+    above : (regions + sources, others) array
+        L F: the same for the sky above lmax; without columns if the model ends there.
     """
 
     mean: Float[np.ndarray, " white"] = quantity("1", "departure of the sky from its prior")
     error: Float[np.ndarray, "area white"] = quantity("K", "temperature missed per departure")
+    above: Float[np.ndarray, "area others"] = quantity("K", "the same for the sky above lmax")
 
     @classmethod
     def of(
-        cls, highest_altitude: Pixels, posterior: Posterior, covariance: WithSky, w: Columns
+        cls,
+        highest_altitude: Pixels,
+        posterior: Posterior,
+        covariance: WithSky,
+        w: Columns,
+        above: Columns,
     ) -> Departure:
         """Compute it from a posterior given a channel's own data.
 
@@ -111,6 +122,8 @@ class Departure:
             Of the sky and of :class:`.Fluxes` with the sky, in K^2.
         w : (modes + sources, shared) array
             Root of the part of it that would vanish if what channels share were known, in K.
+        above : (modes + sources, others) array
+            F: covariance with the sky above lmax, in prior standard deviations, if that is known.
         """
         prior, mean = posterior.prior, np.asarray(posterior.mean)
         n, inside = len(mean), np.stack([*sky_regions(highest_altitude).values()])
@@ -118,7 +131,7 @@ class Departure:
         error = np.asarray(prior.whiten(rows @ covariance - (rows @ w) @ w[:n].T))
         u = np.asarray(prior.whiten(mean) - prior.white_mean)
         v = np.asarray(prior.whiten_columns(u[None]))[0]
-        return cls(u / np.sqrt(u @ u - v @ covariance[:n] @ v), error)
+        return cls(u / np.sqrt(u @ u - v @ covariance[:n] @ v), error, rows @ above)
 
 
 @dataclass(frozen=True)
@@ -200,6 +213,8 @@ class RegionTemperatures:
         parts[UNOBSERVED] = of_hidden**2 / max(hidden @ covariance @ hidden, TINY)
         if departure is not None:
             parts[UNMEASURED] = (departure.error**2).sum(1)
+            if departure.above.size:
+                parts[ABOVE_LMAX] = (departure.above**2).sum(1)
         return cls(
             (*regions, *fluxes.names),
             tuple(parts),
@@ -282,7 +297,7 @@ class SkySpectrum:
         else:
             covariance = np.einsum("frw,grw->rfg", common, common)
             if not n_draws:
-                errors = np.stack([one.error for one in departures])
+                errors = np.stack([np.hstack([one.error, one.above]) for one in departures])
                 alike = correlation_of_departures(np.stack([one.mean for one in departures]))
                 covariance += alike * np.einsum("frw,grw->rfg", errors, errors)
             covariance[:, *np.diag_indices(n)] = std.T**2

@@ -53,10 +53,10 @@ from lusee_bayes.core.trees import StoredTree, from_tree, write_tree
 from lusee_bayes.experiment.data_files import Data, anchored, digest_of
 from lusee_bayes.experiment.experiment import build, draw_key
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.unknowns import Unknowns
+from lusee_bayes.experiment.unknowns import SkyAbove, Unknowns, in_common
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
-from lusee_bayes.linear.amplitudes import AlikeErrors, Tied, kernel, tie
+from lusee_bayes.linear.amplitudes import AlikeAbove, AlikeErrors, Tied, kernel, tie
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.results import sky_spectrum
@@ -120,8 +120,11 @@ class ChannelFiles:
             information = from_tree(Information, tree.children["information"], str(path))
             if tied is None:
                 return information
-            unknowns = from_tree(Unknowns, tree.children["unknowns"], str(path))
-        return unknowns.whole(information, tied, number)
+            unknowns, above = (
+                from_tree(kind, tree.children[name], str(path)) if name in tree.children else None
+                for name, kind in (("unknowns", Unknowns), ("above", SkyAbove))
+            )
+        return in_common(unknowns, above, tied, number).information(information)
 
 
 @dataclass(frozen=True)
@@ -134,6 +137,7 @@ class ChannelInformation:
     known : ChannelData
     unknowns : Unknowns or None
         Receivers, ground and gain table given the sky, where the model has them.
+    above : SkyAbove or None
     sky : (modes,) array
         The scenario's model sky, in K.
     share : Share or None
@@ -143,6 +147,7 @@ class ChannelInformation:
     information: Information
     known: ChannelData
     unknowns: Unknowns | None
+    above: SkyAbove | None
     sky: Float[np.ndarray, " mode"]
     share: Share | None
 
@@ -152,7 +157,7 @@ class ChannelInformation:
         sky, share = np.asarray(made.experiment.setup.sky.modes), None
         if made.unknowns is not None and made.unknowns.shared.size:
             share = Share.of(made)
-        return cls(made.information, made.of_all(data), made.unknowns, sky, share)
+        return cls(made.information, made.of_all(data), made.unknowns, made.above, sky, share)
 
     def seen(self) -> Seen:
         """Inputs for the joint posterior: share, reference sky and model sky."""
@@ -176,7 +181,8 @@ class ChannelInformation:
         information, unknowns, data = self.information, self.unknowns, self.known
         n, key, n_draws = information.n_modes, draw_key(scenario), scenario.output.draws
         if tied is not None:
-            information = unknowns.whole(information, tied, number)
+            shared = in_common(unknowns, self.above, tied, number)
+            information = shared.information(information)
         draws, spread, common = components.draws, components.spread, None
         if (mode := components.mode) is not None:
             sky = positive_joint.positive_sky(mode, number, information, spread, draws, key)
@@ -185,9 +191,10 @@ class ChannelInformation:
             sky = joint.channel_sky(components.prior, number, information, *means, key)
             common = partial(joint.sky_slopes, components.prior, number, information, sky.lower)
         mean, covariance, drawn = sky.mean[:n], sky.covariance[:n, :n], sky.draws[:, :n]
-        if tied is not None:
-            unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
         if unknowns is not None:
+            if tied is not None:
+                given = unknowns.amplitudes if self.above is None else self.above.amplitudes
+                unknowns = unknowns.given_all(given.with_shared(shared, sky.mean, sky.covariance))
             data = data.given(unknowns.table(mean, covariance))
         return channel_result(
             data,
@@ -295,7 +302,7 @@ def solve_components(
     """
     spectral, stages, frequencies = scenario.spectral, channels.stages, scenario.frequencies_mhz
     tied, mode = channels.tied, None
-    white = np.zeros(0) if tied is None else tied.white
+    white = np.zeros(0) if tied is None else tied.start
     if spectral.model == "positive":
         with stages("templates"):
             skies = spectral.positive_skies(frequencies, scenario.lmax)
@@ -344,25 +351,28 @@ class Share:
     priors: dict[str, tuple[float, float]]
     fits: bool
     log_evidence: float
-    slopes: Float[np.ndarray, "unknown mode"] | None = None
+    slopes: Float[np.ndarray, "unknown any_mode"] | None = None
     departure: Float[np.ndarray, " mode"] | None = None
 
     @classmethod
     def of(cls, made: Conditioned, n_draws: int = 0, departure: Departure | None = None) -> Share:
         """Make it from a channel: its unknowns, and its posterior of the sky."""
-        unknowns, inferred = made.unknowns, made.from_data
-        posterior = unknowns.amplitudes.integrated(made.posterior.mean, made.covariance)
-        shared = unknowns.shared
+        unknowns, inferred, above = made.unknowns, made.from_data, made.above
+        amplitudes = unknowns.amplitudes if above is None else above.amplitudes
+        posterior = amplitudes.integrated(made.posterior.mean, made.covariance)
+        shared, n = unknowns.shared, len(unknowns.rows)
         octaves = dict(zip(unknowns.shared_names, unknowns.octaves[shared].tolist(), strict=True))
         priors = {row["unknown"]: (row["prior"], row["prior_std"]) for row in unknowns.rows}
         spread = posterior.covariance[np.ix_(shared, shared)]
         figures = n_draws, priors, inferred.fits, float(inferred.posterior.log_evidence)
-        parts = octaves, (unknowns.expected + posterior.mean)[shared], spread, *figures
+        parts = octaves, unknowns.expected[shared] + posterior.mean[shared], spread, *figures
         if departure is None:
             return cls(*parts)
-        slopes = np.linalg.solve(spread, -posterior.with_sky[:, shared].T)
-        slopes = np.asarray(made.posterior.prior.whiten(slopes))
-        return cls(*parts, slopes, departure.mean)
+        slopes = np.asarray(made.posterior.prior.whiten(-posterior.with_sky[:, shared].T))
+        if above is not None:
+            beyond = -posterior.covariance[shared, n:] @ above.directions.T
+            slopes = np.concatenate([slopes, beyond], axis=1)
+        return cls(*parts, np.linalg.solve(spread, slopes), departure.mean)
 
 
 class Seen(NamedTuple):
@@ -515,7 +525,7 @@ def tie_channels(
     tests = shared_tests(mean, covariance, kernels, names, frequencies_mhz)
     alike = None
     if all(one.departure is not None for one in shared):
-        slopes = np.zeros((*mean.shape, len(shared[0].departure)))
+        slopes = np.zeros((*mean.shape, shared[0].slopes.shape[1]))
         for number, one in enumerate(shared):
             slopes[number, [names.index(name) for name in one.octaves]] = one.slopes
         departures = np.stack([one.departure for one in shared])
@@ -669,6 +679,11 @@ def map_channels(
             seen = [changed.get(f, one) for f, one in zip(frequencies, seen, strict=True)]
         tied, tests = tie_channels(scenario, frequencies, [one.share for one in seen])
     if scenario.joint:
+        some = sorted({0, len(mapped) // 2, len(mapped) - 1})
+        above = [files.read(mapped[k], ChannelInformation).above for k in some]
+        if above[0] is not None:
+            alike = AlikeAbove.of([a.directions for a in above], np.stack([s.sky for s in seen]))
+            tied = replace(tied or Tied.of_nothing(len(mapped)), above=alike)
         at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
         components, posterior = solve_components(
             _without(unmapped, scenario), at_hand, seen, max(scenario.output.draws, N_DRAWS)
