@@ -158,11 +158,7 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
         For names that are unknown or given twice, wrong shapes, autos that are not real,
         infinities, and an unknown convention.
     """
-    masked = (
-        np.ma.getmaskarray(data)
-        if isinstance(data, np.ma.MaskedArray)
-        else getattr(data, "mask", False)
-    )
+    masked = getattr(data, "mask", False)
     data = _numbers(data)
     require_known("unknown convention", convention, CONVENTIONS)
     ports_and_parts = _columns(products, np.iscomplexobj(data), n_antennas)
@@ -273,8 +269,7 @@ class DataLayout(Described, eqx.Module):
         InputError
             If all samples are flagged.
         """
-        flags = np.asarray(flags, dtype=bool)
-        if flags.all():
+        if (flags := np.asarray(flags, dtype=bool)).all():
             raise InputError(f"all {flags.size} samples are flagged or missing: nothing to map")
         return cls(*flags.shape, None if not flags.any() else np.flatnonzero(~flags.ravel()))
 
