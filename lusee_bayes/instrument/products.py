@@ -370,8 +370,7 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
     if not absent.any():
         return visibilities
     i, j, _ = ports(antennas_of(layout.n_products))
-    table = pandas.DataFrame(np.where(absent, np.nan, values).T)
-    filled = table.interpolate(limit_direction="both").fillna(0.0).to_numpy().T
+    filled = interpolated(np.where(absent, np.nan, values))
     values, measured = np.where(absent, filled, values), present.any(1)
     autos, names = i == j, labels_of(layout.n_products)
     unused = autos & absent.all(1)
@@ -384,3 +383,9 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
             )
     values[unused] = values[autos & ~absent.all(1)].mean(0)
     return namespace(visibilities).asarray(values)
+
+
+def interpolated(grid: Grid) -> Grid:
+    """Visibilities with NaN interpolated in time, and 0 for products without any."""
+    table = pandas.DataFrame(np.asarray(grid).T).interpolate(limit_direction="both")
+    return table.fillna(0.0).to_numpy().T
