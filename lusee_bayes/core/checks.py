@@ -84,8 +84,7 @@ def require_float64(name: str, array: Any) -> None:
         If it is not an array of float64, or has a unit or a mask.
     """
     require_plain(name, array)
-    dtype = getattr(array, "dtype", None)
-    if dtype != np.float64:
+    if (dtype := getattr(array, "dtype", None)) != np.float64:
         got = f"an array of {dtype}" if dtype is not None else f"a {type(array).__name__}"
         raise InputError(f"{name} must be a float64 array, got {got}; use x.astype(numpy.float64)")
 
@@ -177,8 +176,7 @@ def require_positive(name: str, array: Any, hint: str = "") -> None:
         return
     require_plain(name, array)
     values = np.asarray(array)
-    bad = ~(values > 0) | ~np.isfinite(values)
-    if bad.any():
+    if (bad := ~(values > 0) | ~np.isfinite(values)).any():
         detail = f"got {values}" if values.ndim == 0 else f"fails at {_first_offenders(bad)}"
         raise InputError(f"{name} must be positive, {detail}" + (f"; {hint}" if hint else ""))
 

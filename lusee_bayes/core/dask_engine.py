@@ -221,8 +221,7 @@ def own_workers(n: int, demand: engine.Demand) -> Iterator[distributed.LocalClus
         If the workers do not fit into the memory.
     """
     side_by_side = min(demand.side_by_side, max(1, engine.processors() // n))
-    needed = n * demand.process_bytes(side_by_side)
-    if needed > memory_limit():
+    if (needed := n * demand.process_bytes(side_by_side)) > memory_limit():
         wrong = f"{n} workers need {gigabytes(needed)} of {gigabytes(memory_limit())}: use fewer"
         raise InputError(wrong)
     settings = {

@@ -59,8 +59,7 @@ def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
     list
         Results in the order of the items.
     """
-    n_threads = min(len(items), processors(), MOST)
-    if n_threads < 2:
+    if (n_threads := min(len(items), processors(), MOST)) < 2:
         return [function(item) for item in items]
     with threads(n_threads) as pool:
         return list(pool.map(function, items))

@@ -291,8 +291,7 @@ def require_format(path: str | Path, format_: str, what: str, hint: str = "") ->
         If the file is missing, damaged or of another kind.
     """
     path = require_file(path, what, hint)
-    actual = format_of(path)
-    if actual != format_:
+    if (actual := format_of(path)) != format_:
         raise InputError(
             f"{path} does not contain {what}: its format is '{actual or 'absent'}', expected "
             f"'{format_}'" + (f"; {hint}" if hint else "")

@@ -58,8 +58,7 @@ def factor_to(where: str, unit: str, stated: Any) -> float:
 
 def require_mhz(where: str, mhz: Any) -> None:
     """Check that frequencies are plausible in MHz; InputError if one is too high to be."""
-    largest = float(np.max(mhz))
-    if largest > LARGEST_MHZ:
+    if (largest := float(np.max(mhz))) > LARGEST_MHZ:
         raise InputError(f"{where}: got {largest:g} MHz, {NOT_HZ}")
 
 

@@ -127,8 +127,7 @@ def _reason(error: BaseException) -> str:
 def read_text(path: str | Path, what: str, hint: str = "") -> str:
     """Read a text file in UTF-8. InputError if it is unreadable or too large."""
     with reading(path, what, hint) as file:
-        size = file.stat().st_size
-        if size > LARGEST_TEXT:
+        if (size := file.stat().st_size) > LARGEST_TEXT:
             raise InputError(f"'{path}' has {size:,} bytes; expected {what}")
         text = file.read_bytes().decode("utf-8-sig")
     if "\0" in text:

@@ -120,8 +120,7 @@ def to_tree(value: Any) -> xarray.DataTree:
     """
     variables, attributes, groups, empty = {}, {}, {}, {}
     for name, kind in _fields(type(value)).items():
-        held = getattr(value, kind.field)
-        if held is None:
+        if (held := getattr(value, kind.field)) is None:
             continue
         if kind.what == "array":
             array = np.asarray(held)

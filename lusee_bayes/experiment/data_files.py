@@ -153,8 +153,7 @@ def _require_same_reduction(path: Path, scenario: Scenario) -> None:
     for section, keys in OF_REDUCTION.items():
         given = whole.get(section) or {}
         for key in sorted(keys & given.keys()):
-            said = made.get(section, given).get(key, given[key])
-            if said != given[key]:
+            if (said := made.get(section, given).get(key, given[key])) != given[key]:
                 raise InputError(
                     f"{path} was reduced with {section}.{key}={said}, not {given[key]} as in the "
                     f"scenario; reduce the sessions again, or remove {section}.{key}"

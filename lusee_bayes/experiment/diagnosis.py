@@ -25,7 +25,6 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Float, Int
 
 from lusee_bayes.core.arrays import Ells, Grid, Square
@@ -39,7 +38,7 @@ from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing, offset_kind, offset_names, with_offsets
-from lusee_bayes.instrument.products import all_products, auto_indices, ports
+from lusee_bayes.instrument.products import all_products, auto_indices, interpolated, ports
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import ChiSquare, stands_out
 from lusee_bayes.judge.residuals import Residuals
@@ -261,19 +260,14 @@ class UnderAnySky:
     def without(self, mistake: DataMistake) -> ChiSquare:
         """Residual chi^2 of the data without a mistake, with N rebuilt for them."""
         data, layout = self.around.data, self.around.data.layout
-        data = replace(data, data=np.asarray(layout.gather(mistake.undone(filled(data)))))
+        undone = mistake.undone(interpolated(data.grid()))
+        data = replace(data, data=np.asarray(layout.gather(undone)))
         try:
             around = replace(self.around, data=data, visibilities=None, gains=None)
             model = full_model(self.setup, around)
         except InputError:  # undoing it makes some auto negative or zero
             return ChiSquare(np.inf, float(layout.size))
         return replace(self, around=around, model=model).wide(model.coupling)[0]
-
-
-def filled(data: Visibilities) -> Grid:
-    """The data on the full grid, with missing samples interpolated in time."""
-    grid = pd.DataFrame(np.asarray(data.grid()).T).interpolate(limit_direction="both")
-    return grid.fillna(0.0).to_numpy().T
 
 
 # number of times to try one by one, the worst first
@@ -296,7 +290,8 @@ class MixedProducts:
     @classmethod
     def of(cls, judge: UnderAnySky, solution: Solution) -> MixedProducts:
         """Compute Q from data and their solution under the wide prior."""
-        grid, layout, offset = filled(data := judge.around.data), data.layout, judge.model.offset
+        data, offset = judge.around.data, judge.model.offset
+        grid, layout = interpolated(data.grid()), data.layout
         n, product, time = len(grid), layout.product, layout.time
         mixed = np.zeros((layout.size, n, n))
         mixed[np.arange(layout.size), product] = grid[:, time].T

@@ -153,9 +153,8 @@ class SurveySection(Section):
             raise InputError(f"{self.file} has no pixels for prior.surveys.mask_file")
         factor = (frequency_mhz / self.frequency_mhz) ** self.index
         modes = factor * sky.modes_at(self.frequency_mhz, lmax)
-        widths = self.scale_std, factor * self.zero_std_k
         name = f"{Path(self.file).name} at {self.frequency_mhz:g} MHz"
-        return Survey(name, modes, beam, *widths, unseen)
+        return Survey(name, modes, beam, self.scale_std, factor * self.zero_std_k, unseen)
 
 
 SKY_SECTIONS = kinds_of(GalaxySection, FileSkySection)
@@ -389,8 +388,7 @@ class SpectralSection(Section):
         InputError
             If fields up to the map's lmax already have too many unknowns.
         """
-        highest = int(np.sqrt(MOST_UNKNOWNS / len(self.fields))) - 1
-        if highest < lmax:
+        if (highest := int(np.sqrt(MOST_UNKNOWNS / len(self.fields))) - 1) < lmax:
             raise InputError(
                 f"positive joint skies of lmax {lmax} have "
                 f"{len(self.fields) * harmonics.n_modes(lmax)} unknowns, more than the "

@@ -280,8 +280,7 @@ class Unknowns:
         inference : Inference
             Inference from these data alone.
         """
-        held = inference.expanded
-        if not held:
+        if not (held := inference.expanded):
             return None
         octaves, alike = [], []
         for part in held:

@@ -88,8 +88,7 @@ class BlindSpot:
 
 def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     """Errors that would move the map unnoticed, in one sentence; empty if there are none."""
-    unseen = [spot for spot in spots if spot.shown <= SEEN and spot.bias > 1.0]
-    if not unseen:
+    if not (unseen := [spot for spot in spots if spot.shown <= SEEN and spot.bias > 1.0]):
         return ""
     unseen = sorted(unseen, key=lambda spot: -spot.bias)[:MOST_NAMED]
     named = ", ".join(f"{one.name} by {one.size:.3g}{one.unit} ({one.bias:.2g})" for one in unseen)
@@ -122,8 +121,7 @@ def errors_of(setup: Setup, model: LinearGaussian, sky: Modes, has: set[str]) ->
         fields = FieldErrors.build(section, setup, Around())
         yield {FIELDS_NAME: 100.0 * FIELDS}, " %", 1, columns(fields)
     values = {name: float(p.value) for name, p in source.parameters().items() if name not in has}
-    priors = tuple(Unknown(n, v, PARAMETERS * abs(v)) for n, v in values.items() if v)
-    if priors:
+    if priors := tuple(Unknown(n, v, PARAMETERS * abs(v)) for n, v in values.items() if v):
         sizes = {unknown.name: 100.0 * PARAMETERS for unknown in priors}
         yield sizes, " %", 1, columns(InstrumentParameters(priors, setup.instrument))
     steps = {name: step for name, step in unknowns.tested_offsets(setup).items() if name not in has}

@@ -202,8 +202,7 @@ def comb_strength(autos: Autos, frames: Rows, averaging: Averaging, middles_mhz:
     (rows,) array
         For the port with the largest difference; 0 if every bin contains a channel of the comb.
     """
-    comb = comb_bins(averaging)
-    if comb.all():
+    if (comb := comb_bins(averaging)).all():
         return np.zeros(len(autos))
     mhz = middles_mhz[averaging.channels()].mean(axis=1)
     at = np.flatnonzero(comb & (mhz > COMB_MHZ[0]) & (mhz < COMB_MHZ[1]))

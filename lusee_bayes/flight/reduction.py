@@ -136,8 +136,7 @@ def _read_ahead(
     reads: dict[int, session.Read] = {}
 
     def counts(rows: slice) -> np.ndarray:
-        number = int(line.session[rows.start])
-        if number not in reads:
+        if (number := int(line.session[rows.start])) not in reads:
             reads[number] = files.enter_context(line.sessions[number].spectra())
         first = int(line.row[rows.start])
         return reads[number](first, first + rows.stop - rows.start)

@@ -334,8 +334,7 @@ class CouplingMatrix(Coupling):
             A of these beams.
         """
         body = body_beams(modes, pointing)
-        lmax = len(pointing.pole_from_galactic.blocks) - 1
-        return cls(body, _by_order(body, lmax), pointing, layout, modes)
+        return cls(body, _by_order(body, lmax_of(body.shape[-1])), pointing, layout, modes)
 
     @classmethod
     def observe(cls, beams: ProductBeams, observation: Observation) -> CouplingMatrix:

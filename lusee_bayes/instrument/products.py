@@ -158,11 +158,7 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
         For names that are unknown or given twice, wrong shapes, autos that are not real,
         infinities, and an unknown convention.
     """
-    masked = (
-        np.ma.getmaskarray(data)
-        if isinstance(data, np.ma.MaskedArray)
-        else getattr(data, "mask", False)
-    )
+    masked = getattr(data, "mask", False)
     data = _numbers(data)
     require_known("unknown convention", convention, CONVENTIONS)
     ports_and_parts = _columns(products, np.iscomplexobj(data), n_antennas)
@@ -273,8 +269,7 @@ class DataLayout(Described, eqx.Module):
         InputError
             If all samples are flagged.
         """
-        flags = np.asarray(flags, dtype=bool)
-        if flags.all():
+        if (flags := np.asarray(flags, dtype=bool)).all():
             raise InputError(f"all {flags.size} samples are flagged or missing: nothing to map")
         return cls(*flags.shape, None if not flags.any() else np.flatnonzero(~flags.ravel()))
 
@@ -375,8 +370,7 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
     if not absent.any():
         return visibilities
     i, j, _ = ports(antennas_of(layout.n_products))
-    table = pandas.DataFrame(np.where(absent, np.nan, values).T)
-    filled = table.interpolate(limit_direction="both").fillna(0.0).to_numpy().T
+    filled = interpolated(np.where(absent, np.nan, values))
     values, measured = np.where(absent, filled, values), present.any(1)
     autos, names = i == j, labels_of(layout.n_products)
     unused = autos & absent.all(1)
@@ -389,3 +383,9 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
             )
     values[unused] = values[autos & ~absent.all(1)].mean(0)
     return namespace(visibilities).asarray(values)
+
+
+def interpolated(grid: Grid) -> Grid:
+    """Visibilities with NaN interpolated in time, and 0 for products without any."""
+    table = pandas.DataFrame(np.asarray(grid).T).interpolate(limit_direction="both")
+    return table.fillna(0.0).to_numpy().T

@@ -443,8 +443,7 @@ def _bounded(times: Time, bounds: Time, step_s: float | None) -> tuple[Times, Ti
     length = end - start
     step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)
     rounding = _rounding(step)
-    outside = ((start > rounding) | (end < -rounding)) & (length > 0.0)
-    if outside.any():
+    if (outside := ((start > rounding) | (end < -rounding)) & (length > 0.0)).any():
         first = int(np.argmax(outside))
         raise InputError(
             f"the time of sample {first} ({times[first].isot[:19]}) is not within its bounds, "

@@ -27,8 +27,7 @@ def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: in
     """
     warnings = []
     names, r_hat = table["quantity"], np.nan_to_num(table["r_hat"], nan=-np.inf, posinf=np.inf)
-    above = int((r_hat > AGREE).sum())
-    if above:
+    if above := int((r_hat > AGREE).sum()):
         furthest = int(np.argmax(r_hat))
         warnings.append(
             f"Not converged: R-hat is above {AGREE:g} for {above} of {len(names)} quantities, "
@@ -37,8 +36,7 @@ def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: in
     least = PER_CHAIN * chains
     for column, what in (("ess_bulk", "bulk"), ("ess_tail", "tail")):
         size = np.nan_to_num(table.get(column, np.inf), nan=np.inf)
-        few = int((size < least).sum())
-        if few:
+        if few := int((size < least).sum()):
             worst = int(np.argmin(size))
             warnings.append(
                 f"The {what} effective size is below {least} for {few} of {len(names)} quantities, "

@@ -215,8 +215,7 @@ def residuals(
     model, layout = solution.model, data.layout
     split = Split.of(solution.posterior, solution.chi2, model.n_data, solution.matrix)
     split = replace(split, instrument=split.instrument.allowing(unused))
-    left_out = LeftOut.of(replace(model, prior=split.wide.prior), data, split.wide)
-    if left_out is None:
+    if (left_out := LeftOut.of(replace(model, prior=split.wide.prior), data, split.wide)) is None:
         return Residuals(np.full(model.n_data, np.nan), split, (), learned)
     whole = split.instrument
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lusee_bayes.core.arrays import ModesMatrix, Square
+from lusee_bayes.core.arrays import ModesMatrix
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import cholesky, lower_triangle, solve_lower, times_lower
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.noise.covariance import log_det_of_lower
 
 # k relative to the sky's strength in units of the prior
 WIDER = 10.0
@@ -114,7 +115,7 @@ def widened(
     InputError
         If Lambda_k cannot be factorised.
     """
-    prior, log_det = posterior.prior, log_det_of(posterior.lower)
+    prior, log_det = posterior.prior, log_det_of_lower(posterior.lower)
     off = posterior.white_mean - prior.white_mean
     # outside the span of a basis, the posterior is the prior
     inside = off if posterior.basis is None else posterior.basis.T @ off
@@ -136,12 +137,7 @@ def widened(
     step = (factor**2 - 1.0) * solve_lower(root, half, transpose=True)[:, 0]
     less = (1.0 - factor**-2) * float(inside @ (inside + step))
     moved = step if posterior.basis is None else posterior.basis @ step
-    log_evidence = posterior.log_evidence + 0.5 * (less + log_det - log_det_of(root))
+    log_evidence = posterior.log_evidence + 0.5 * (less + log_det - log_det_of_lower(root))
     mean, evidence = (posterior.white_mean + moved) / factor, np.asarray(log_evidence)
     parts = prior.widened(factor), mean, root, posterior.basis, evidence, posterior.refinement
     return Posterior(*parts), less
-
-
-def log_det_of(root: Square) -> float:
-    """ln|M| of a matrix with this Cholesky factor."""
-    return 2.0 * float(np.log(np.diagonal(root)).sum())

@@ -272,8 +272,7 @@ class Solution(Described):
     @cached_property
     def information(self) -> of_data.Information:
         """ln p(d | m) as a function of the sky; only its reference depends on the prior."""
-        kept = self.kept_information
-        if kept is None:
+        if (kept := self.kept_information) is None:
             kept = FromInformation.of(self.model).condition(self.data).kept_information
         return replace(kept, misfit=np.asarray(kept.misfit - self.excess))
 

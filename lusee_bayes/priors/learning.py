@@ -261,8 +261,7 @@ def learn(
         path.append((point.parameters, gradient))
         curvature = _corrected(point.curvature(family, rng, SIMULATIONS), path)
         step = np.linalg.solve(curvature, gradient)
-        gain = 0.5 * float(gradient @ step)
-        if gain < SETTLED:
+        if (gain := 0.5 * float(gradient @ step)) < SETTLED:
             return _learned(family, information, point, rng)
         point = _climb(family, information, point, step * min(1.0, LONGEST / np.abs(step).max()))
     raise InputError(

@@ -53,8 +53,7 @@ def describe_diagnostics(path: Path) -> list[str]:
     with trees.opened_tree(path, formats.DIAGNOSTICS, "diagnostics of lusee-bayes map") as tree:
         for frequency, channel in sorted(tree.children.items(), key=lambda one: float(one[0])):
             lines.append(f"diagnostics of a map at {frequency} MHz")
-            judged = channel.children.get("judged")
-            if judged is None:
+            if (judged := channel.children.get("judged")) is None:
                 lines.append("the data fit as a whole; their groups were not tested")
                 continue
             kinds, n = np.unique(judged.children["groups"].variables["kind"], return_counts=True)
@@ -142,8 +141,7 @@ def describe_folder(folder: Path) -> list[str]:
         If the folder is not that of a finished run.
     """
     files.recover(folder)
-    manifest = files.read_manifest(folder)
-    if manifest is None:
+    if (manifest := files.read_manifest(folder)) is None:
         wrong = f"'{folder}' is not the folder of a run: no manifest.json; give a file or a folder"
         raise InputError(wrong)
     lines = [f"results of lusee-bayes {manifest['kind']}"]
@@ -199,8 +197,7 @@ def describe(path: str | Path) -> str:
         lines = describe_folder(Path(path))
     else:
         path = reading.require_file(path, "file")
-        kind = formats.format_of(path) or ""
-        if kind in DESCRIBED:
+        if (kind := formats.format_of(path) or "") in DESCRIBED:
             lines = DESCRIBED[kind](path)
         else:
             lines = _cards(path) if formats.is_fits(path) else []

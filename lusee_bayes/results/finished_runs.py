@@ -148,8 +148,7 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
     skies["independent_mean"] = result.stacked("independent")
     on_modes, kelvin = ("frequency", "mode"), {"units": "K"}
     variables = {n: (on_modes, values, kelvin) for n, values in skies.items() if values is not None}
-    covariance = result.stacked("covariance")
-    if covariance is not None:
+    if (covariance := result.stacked("covariance")) is not None:
         variables["covariance"] = ((*on_modes, "mode_2"), covariance, {"units": "K2"})
     if joint is not None:
         # fields of positive skies may have more modes than the maps
@@ -268,8 +267,7 @@ def read_information(path: Path, channel: Scenario) -> SavedInformation:
     """
     name = f"{channel.frequency_mhz:.15g}"
     with opened_tree(path, formats.POSTERIOR, KEPT) as tree:
-        kept = tree.children.get(INFORMATION)
-        if kept is None:
+        if (kept := tree.children.get(INFORMATION)) is None:
             raise InputError(
                 f"{path} lacks the information of its data; make that map again with --information"
             )
@@ -445,8 +443,7 @@ class FinishedRun:
 
     def cross_in_words(self) -> str:
         """First ell with SNR < 1, "> lmax" if there is none, or "no truth"."""
-        cross = self.channel.ell_cross
-        if cross is not None:
+        if (cross := self.channel.ell_cross) is not None:
             return str(cross)
         lmax = len(self.channel.prior_fraction) - 1
         return "no truth" if self.channel.truth is None else f"> {lmax}"

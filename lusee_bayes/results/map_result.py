@@ -227,8 +227,7 @@ class MapResult(Described):
             given = "every channel uses the constraints from all others"
             lines.append(f"Unknowns of {words} are {like} at {where}: {given}.")
         nulls = {f: report.null for f, report in reports.items() if report.null is not None}
-        left_open = [f for f, null in nulls.items() if null.sentence()]
-        if left_open:
+        if left_open := [f for f, null in nulls.items() if null.sentence()]:
             worst = max(left_open, key=lambda f: nulls[f].share)
             lines.append(
                 f"One parameter combination is nearly unconstrained at {len(left_open)} of "
@@ -256,8 +255,7 @@ class MapResult(Described):
         if self.scenario.shared and self.joint is None and len(self.channels) > 1:
             kind += " except for the instrument that they share"
         parts = [f"{counted(len(self.channels), 'frequency', 'frequencies')}, {kind}"]
-        crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]
-        if crosses:
+        if crosses := [c.ell_cross for c in self.channels if c.ell_cross is not None]:
             parts.append(f"SNR < 1 first at ell {min(crosses)} to {max(crosses)}")
         parts.append(f"ln evidence {self.log_evidence:.1f}")
         joint = self.joint
@@ -290,8 +288,7 @@ class MapResult(Described):
 
     def _flags(self) -> list[str]:
         """The flagged share of flight data, and doubts about them."""
-        reduced = self.reduced
-        if reduced is None:
+        if (reduced := self.reduced) is None:
             return []
         if not self.single:
             return [reduced.flag_line().capitalize(), *reduced.notes()]
@@ -362,8 +359,7 @@ class MapResult(Described):
         )
 
     def _joint_summary(self) -> JointSummary | None:
-        joint = self.joint
-        if joint is None:
+        if (joint := self.joint) is None:
             return None
         named = {"prior": joint_prior_sentence(self.scenario), "components": joint.prior.names}
         named["solver"] = "direct" if joint.mode is None else "Gauss-Newton rounds"

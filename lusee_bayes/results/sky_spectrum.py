@@ -36,7 +36,7 @@ from jaxtyping import Bool, Float
 from scipy.linalg import block_diag
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import require_known
 from lusee_bayes.core.harmonics import averaging_rows, lmax_of, per_mode, pixel_matrix, taper
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import healpy
@@ -330,8 +330,7 @@ class SkySpectrum:
 
     def place(self, region: str) -> int:
         """Index of a region. InputError for an unknown one."""
-        if region not in self.regions:
-            raise InputError(f"no region '{region}'; {nearest(region, self.regions)}")
+        require_known("no region", region, self.regions)
         return self.regions.index(region)
 
     @property

@@ -420,12 +420,8 @@ class ChannelAlone:
         deviations = made.draws - mean
         if compared is not None:
             deviations = np.concatenate([deviations, compared])
-        kept = (
-            made.covariance,
-            deviations,
-            made.figures(),
-            Share.of(made, len(deviations), data.departure),
-        )
+        share = Share.of(made, len(deviations), data.departure)
+        kept = made.covariance, deviations, made.figures(), share
         return cls(data, made.from_data.solution.information, made.unknowns, mean, *kept)
 
     def seen(self) -> Seen:

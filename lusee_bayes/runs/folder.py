@@ -76,8 +76,7 @@ def inputs_of(
     scenario: Scenario | None, data: Data | None = None, *others: str | Path | None
 ) -> list[str | Path]:
     """The files that a run reads: data, files named by its scenario, and others if given."""
-    tree = {} if scenario is None else scenario.model_dump(mode="json")
-    named = _texts(tree)
+    named = () if scenario is None else _texts(scenario.model_dump(mode="json"))
     given = [] if data is None else files_of(data)
     return [*given, *filter(os.path.isfile, named), *filter(None, others)]
 
@@ -115,8 +114,7 @@ def require_own(folder: Path, kinds: Sequence[str], origin: Origin) -> None:
     InputError
         If it has; the message names the first difference.
     """
-    manifest = files.read_manifest(folder)
-    if manifest is None:
+    if (manifest := files.read_manifest(folder)) is None:
         return
     before, advice = manifest["origin"], "give another folder with -o, or --force to replace them"
     if manifest["kind"] not in kinds:

@@ -36,7 +36,6 @@ from lusee_bayes.sky.prior import PIVOT
 from lusee_bayes.sky.spectral_prior import SpectralPrior, require_names
 
 Number = float | Float[Array, ""]
-White = Float[Array, "*batch unknowns"]
 Exponents = Float[np.ndarray, "*batch columns"]
 OfLaws = Float[np.ndarray, "laws ells"]
 Pair = Float[np.ndarray, "2"]

@@ -227,8 +227,11 @@ def _require_healpix(path: str | Path, n_pixels: int) -> None:
         raise InputError(f"{path} has {n_pixels} values, expected 12 NSIDE^2 of a HEALPix map")
 
 
-def _layout(name: str) -> Layout:
-    return Layout("a HEALPix sky map", {name: Variable(("pixel",), unit="K")})
+def _checked_pixels(path: Path, name: str, given: Any, unit: Any) -> np.ndarray:
+    """In K, and UNSEEN where a file, in its unit and precision, has no data."""
+    layout = Layout("a HEALPix sky map", {name: Variable(("pixel",), unit="K")})
+    values = layout.checked(path, {name: given}, {f"{name}.units": unit}).arrays[name]
+    return np.where(_is_unseen(np.asarray(given)), UNSEEN, values)
 
 
 def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
@@ -240,9 +243,7 @@ def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
                 f"{path} has no dataset '{dataset}', as sky.dataset says (it has "
                 f"{', '.join(sorted(names))}); {nearest(dataset, names)}"
             )
-        units = {f"{dataset}.units": file[dataset].attrs.get("units")}
-        values = _layout(dataset).checked(path, {dataset: file[dataset]}, units).arrays[dataset]
-        return np.where(_is_unseen(file[dataset][()]), UNSEEN, values)
+        return _checked_pixels(path, dataset, file[dataset], file[dataset].attrs.get("units"))
 
 
 def _is_unseen(pixels: np.ndarray) -> Bool[np.ndarray, "..."]:
@@ -260,9 +261,7 @@ def _read_map(path: Path) -> np.ndarray:
         column = tables[0].columns[int(listed)]
         # healpy writes rows of 1024 pixels
         given = np.ravel(tables[0].data.field(int(listed)))
-        units = {f"{column.name}.units": column.unit}
-        values = _layout(column.name).checked(path, {column.name: given}, units).arrays[column.name]
-        values = np.where(_is_unseen(given), UNSEEN, values)
+        values = _checked_pixels(path, column.name, given, column.unit)
         if listed:  # of some pixels only
             some = values
             values = np.full(12 * int(header["NSIDE"]) ** 2, UNSEEN)

@@ -198,8 +198,7 @@ class Setup:
 
     def _with_couplings(self, changed: Callable[[CouplingMatrix], CouplingMatrix]) -> Setup:
         """Change A, also that of the sky above lmax."""
-        above = self.above
-        if above is not None:
+        if (above := self.above) is not None:
             above = replace(above, coupling=changed(above.coupling))
         return replace(self, coupling=changed(self.coupling), above=above)
 

@@ -109,8 +109,7 @@ class GainTable(Systematic):
         used = np.flatnonzero(calibration.gain_slope.any(1))
         port, slope = calibration.gain_port[used], calibration.gain_slope[used]
         for number in np.unique(port):
-            total = float(np.sqrt((slope[port == number] ** 2).sum(0)).max())
-            if total > LARGEST:
+            if (total := float(np.sqrt((slope[port == number] ** 2).sum(0)).max())) > LARGEST:
                 raise InputError(
                     f"the data give the power gain of port {number} an error of {total:.0%}, not "
                     f"at most {LARGEST:.0%}; noise.gain_table.treatment=ignored treats it as exact"

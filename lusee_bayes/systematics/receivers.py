@@ -71,8 +71,7 @@ class ReceiverNoiseSection(Section):
         rise = (frequency_mhz / self.reference_mhz) ** self.slope
         if self.power_k is not None:
             return np.full(source.n_ports, self.power_k * rise)
-        circuit = source.circuit(frequency_mhz)
-        if circuit is None:
+        if (circuit := source.circuit(frequency_mhz)) is None:
             raise InputError(
                 "noise.receiver.power_v2_hz needs antennas calibrated in volts, i.e. a response "
                 "file; give it as beam.file, or use noise.receiver.power_k"

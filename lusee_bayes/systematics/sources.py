@@ -80,8 +80,7 @@ class SourceSection(Section):
             return galactic_unit_vector(self.ra_deg, self.dec_deg)
         if self.name in BODIES:
             return body_direction(self.name, observation)
-        source = CATALOGUE.get(self.name)
-        if source is None:
+        if (source := CATALOGUE.get(self.name)) is None:
             raise InputError(
                 f"unknown source '{self.name}' without ra_deg and dec_deg;"
                 f" {nearest(self.name, [*CATALOGUE, *BODIES])}"

@@ -46,7 +46,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, DataVector, Modes, Vector, namespace, on_device, scalar
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.section import Section
 from lusee_bayes.instrument.coupling import BeamModes, DenseCoupling
@@ -275,10 +275,7 @@ class Systematic(eqx.Module):
         drawn = {name: value if value.ndim else float(value) for name, value in values.items()}
         said = getattr(section, "true_values", {})
         for name in said:
-            if name not in drawn:
-                raise InputError(
-                    f"{cls.key}.true_values has an unknown '{name}'; {nearest(name, tuple(drawn))}"
-                )
+            require_known(f"{cls.key}.true_values has an unknown", name, drawn)
         return drawn | {name: float(value) for name, value in said.items()}
 
     @classmethod
@@ -607,11 +604,10 @@ class ChangedBeams(Systematic):
 
     def linearised(self, model, centre):
         """Differentiate the beams."""
-        beams = np.asarray(model.coupling.modes)
+        coupling, beams = model.coupling, np.asarray(model.coupling.modes)
         slopes = self.differences(lambda values: self.modes(beams, values), centre)
-        see, layout, response = model.coupling.along(slopes), model.coupling.layout, 1.0
-        if model.coupling.response is not None:
-            response = model.coupling.response
+        see, layout = coupling.along(slopes), coupling.layout
+        response = 1.0 if coupling.response is None else coupling.response
         return lambda sky: np.stack([layout.gather(one) * response for one in see(sky)], axis=1)
 
 

@@ -238,8 +238,7 @@ def check_beam_source(
     impedance = source.impedance(frequency_mhz)
     assert impedance is None or np.isfinite(impedance)
     assert source.interpolated(frequency_mhz) in (None, "linear", "spline")
-    circuit = source.circuit(frequency_mhz)
-    if circuit is not None:  # a covariance of voltages, which may be singular
+    if (circuit := source.circuit(frequency_mhz)) is not None:
         per_kelvin = np.linalg.eigvalsh(circuit.per_kelvin)
         assert per_kelvin.min() > -ROUNDING * per_kelvin.max() and per_kelvin.max() > 0.0
 

@@ -136,15 +136,13 @@ def test_other_threads_go_on_meanwhile():
 def test_products_with_a_triangle(n, xp):
     rng = np.random.default_rng(n)
     lower, matrix, x = np.tril(rng.normal(size=(n, n))), spd(n), rng.normal(size=(70, n))
-    given = [xp.asarray(a) for a in (lower, matrix, x)]
+    low, middle, rows = (xp.asarray(a) for a in (lower, matrix, x))
     close = partial(np.testing.assert_allclose, rtol=0, atol=1e-12 * n)
-    close(la.times_lower(given[2], given[0], transpose=False), x @ lower)
-    close(la.times_lower(given[2], given[0], transpose=True), x @ lower.T)
-    for found, expected in (
-        (la.sandwich(given[1], given[0]), lower.T @ matrix @ lower),
-        (la.outer_sandwich(given[1], given[0]), lower @ matrix @ lower.T),
-    ):
-        close(found, expected)
+    close(la.times_lower(rows, low, transpose=False), x @ lower)
+    close(la.times_lower(rows, low, transpose=True), x @ lower.T)
+    for sandwich, left in ((la.sandwich, lower.T), (la.outer_sandwich, lower)):
+        found = sandwich(middle, low)
+        close(found, left @ matrix @ left.T)
         np.testing.assert_array_equal(found, np.asarray(found).T)
     root = np.linalg.cholesky(spd(n + 1)[:n, :n])
     inverse = np.linalg.inv(root)

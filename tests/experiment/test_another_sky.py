@@ -286,13 +286,11 @@ def test_a_mistake_is_told_from_unknown_antennas(wrong):
     assert diagnosis.is_mistaken(set_up(scenario, data), Around(data)) == (wrong is not NOTHING)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("imaginary parts conjugated", marks=pytest.mark.essential),
-        pytest.param("33R 1 % too high", marks=pytest.mark.long),
-    ],
-)
+LARGE_AND_SMALL = [pytest.param("imaginary parts conjugated", marks=pytest.mark.essential)]
+LARGE_AND_SMALL += [pytest.param("33R 1 % too high", marks=pytest.mark.long)]
+
+
+@pytest.mark.parametrize("name", LARGE_AND_SMALL)
 def test_unknown_antennas_do_not_absorb_a_mistake(name):
     """They could: with fields and a sky above lmax, both learned, conjugated data fit."""
     (wrong,) = (one for one in wrong_data.WRONG if one.name == name)
@@ -315,15 +313,11 @@ def test_unknown_antennas_do_not_absorb_a_mistake(name):
 
 
 SOME = [w for w in wrong_data.WRONG if w.name.startswith(("noise", "02I", "port 2 ", "constant"))]
+NONE_AND_SOME = [pytest.param(NOTHING, marks=pytest.mark.essential)]
+NONE_AND_SOME += [pytest.param(one, marks=pytest.mark.long) for one in SOME]
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        pytest.param(NOTHING, marks=pytest.mark.essential),
-        *(pytest.param(one, marks=pytest.mark.long) for one in SOME),
-    ],
-)
+@pytest.mark.parametrize("wrong", NONE_AND_SOME)
 def test_what_unknown_fields_absorb_is_named(wrong, tmp_path):
     """Without errors of the fields, many of the data scatter less than the model expects."""
     data, scenario = of_other_antennas(wrong)

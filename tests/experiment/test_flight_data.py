@@ -113,7 +113,6 @@ def test_reduced_spectra_are_mapped_as_they_were_reduced(tmp_path):
 @pytest.mark.long
 def test_receiver_noise_is_that_of_the_frames_and_channels(tmp_path):
     reduced, truth = simulated(tmp_path, rows=150, step_s=42.0)
-    whole = 0.0
     for band, f in enumerate(FREQUENCIES):
         true = truth["visibility_v2_hz"][band]
         blocks = np.array(exact_blocks(true)) / reduced.n_averaged[band][:, None, None]
@@ -127,7 +126,6 @@ def test_receiver_noise_is_that_of_the_frames_and_channels(tmp_path):
         white = np.linalg.solve(np.linalg.cholesky(blocks[kept]), off[kept][..., None])[..., 0]
         spread = white.T @ white / kept.sum()
         assert np.abs(spread - np.eye(16)).max() < 5.0 * np.sqrt(2.0 / kept.sum())
-        whole += chi2[kept].sum()
     # a band of 40 channels and a parabola: less than 40 independent samples a frame
     assert 0.3 * 40 < reduced.n_averaged.max() / truth["frames"] < 40.0
 

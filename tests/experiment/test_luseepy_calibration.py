@@ -33,10 +33,8 @@ class Naive:
         with fits.open(path) as hdus:
             channel = list(hdus["freq"].data).index(FREQUENCY)
             gain = hdus["gain_conv"].data[channel]
-            parts = {
-                name: hdus[name].data[channel].astype(float)[:, :-1]
-                for name in ("Etheta_real", "Etheta_imag", "EPhi_real", "EPhi_imag")
-            }
+            names = [f"{field}_{part}" for field in ("Etheta", "EPhi") for part in ("real", "imag")]
+            parts = {name: hdus[name].data[channel].astype(float)[:, :-1] for name in names}
         theta = np.radians(np.arange(91.0))[:, None]
         phi = np.radians(2.0 * np.arange(180))[None]
         taper = 1.0 - (np.arctan((theta - np.pi / 2) / 0.03) / np.pi + 0.5) ** 2

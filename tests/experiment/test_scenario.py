@@ -62,17 +62,15 @@ def test_overrides_reach_into_sections_that_the_file_leaves_out(short):
 
 
 HERE = Path(__file__).parent
+MISTAKES = (HERE / "refused_overrides.yaml").read_text("utf-8")
 # a line for each rule and kind of mistake; what single numbers and words may be is below
-REFUSED = [
-    *chain(*parse_yaml((HERE / "refused_overrides.yaml").read_text("utf-8"), "a table").values())
-]
+REFUSED = [*chain(*parse_yaml(MISTAKES, "a table").values())]
 
 
 @pytest.mark.parametrize(("overrides", "message"), REFUSED, ids=lambda text: text[:60])
 def test_errors_name_what_is_wrong(overrides, message):
-    given = re.split(r" (?=[a-z_.]+=)", overrides)
     with refused(message) as caught:
-        load_scenario("fiducial", ["sky.sources=false", *given])
+        load_scenario("fiducial", ["sky.sources=false", *re.split(r" (?=[a-z_.]+=)", overrides)])
     assert len(str(caught.value)) < 250
 
 

@@ -54,11 +54,9 @@ def test_visibilities_agree_with_an_integral_over_the_sky_in_lunartopo(lmax, tur
     ground = [(complex(x), complex(y)) for x, y in zip(s, p, strict=True)]
     antenna = {"frequency_mhz": frequency, "length": 3.0, "height": 2.0, "steps": 121}
     arms = vectors(np.full(4, np.radians(75.0)), np.radians([90.0, 0.0, 270.0, 180.0]))
+    each = list(zip(theta, phi, ground, strict=True))
     voltages = [
-        [
-            arm_response(t, f, arm=arm, reflection=r, **antenna)
-            for t, f, r in zip(theta, phi, ground, strict=True)
-        ]
+        [arm_response(t, f, arm=arm, reflection=r, **antenna) for t, f, r in each]
         for arm in arms  # North, East, South, West
     ]
     e = np.array(voltages)  # (antenna, direction, component)
@@ -108,9 +106,8 @@ def test_dense_rows_are_each_times_own_rotation(coupling):
     o = two_runs()
     dense = np.asarray(coupling.dense()).reshape(16, o.n_times, -1)
     a, beams = steep_sky(LMAX, monopole=1.0), random_beams(1).modes
-    topocentric = o.topocentric_from_mcmf() @ o.mcmf_from_galactic
     for k in (0, 5, o.n_times - 1):
-        seen = Rotation.from_matrix(topocentric[k], LMAX)(a)
+        seen = Rotation.from_matrix(o.topocentric_from_mcmf() @ o.mcmf_from_galactic[k], LMAX)(a)
         expected = np.asarray(turn_about_z(beams, np.radians(o.turntable_deg[o.run[k]])) @ seen)
         # the neglected third order of the tilts: (1e-3)^3 of low modes
         close(dense[:, k] @ np.asarray(a), expected, 1e-8)

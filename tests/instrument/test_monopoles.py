@@ -21,8 +21,7 @@ def test_fields_agree_with_a_sum_along_the_arms(frequency, options):
     fields = m.fields(frequency, GRID)
     s, p = m.regolith.reflection(np.cos(GRID.theta), frequency)
     scale = np.abs(fields.e_theta).max()
-    sizes = {"length": float(m.length_m), "height": float(m.height_m)}
-    antenna = {"frequency_mhz": frequency, **sizes}
+    antenna = {"frequency_mhz": frequency, "length": float(m.length_m), "height": float(m.height_m)}
     # North, East, South, West
     azimuths = np.radians([90.0, 0.0, 270.0, 180.0])
     arms = vectors(np.full(4, np.radians(float(m.zenith_angle_deg))), azimuths)

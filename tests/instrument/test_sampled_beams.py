@@ -48,12 +48,9 @@ def on_grid(antennas, frequency_mhz=FREQUENCY) -> dict[str, np.ndarray]:
 def as_products(given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Beams of products in place of fields: (Et Ft* + Ep Fp*) / 2 written out."""
     theta, phi = given["e_theta"], given["e_phi"]
-    pairs = [
-        [(a * b.conj() + c * d.conj()) / 2 for b, d in zip(theta, phi, strict=True)]
-        for a, c in zip(theta, phi, strict=True)
-    ]
+    pairs = (theta[:, None] * theta.conj() + phi[:, None] * phi.conj()) / 2
     angles = {name: one for name, one in given.items() if name.endswith("deg")}
-    return {"products": to_real(np.array(pairs)), **angles}
+    return {"products": to_real(pairs), **angles}
 
 
 KINDS = {

@@ -67,8 +67,7 @@ def test_intervals_are_cut_as_by_a_loop(seed, step_s):
     o = lb.Observation.from_schedule(intervals, step_s=step_s)
     expected = naive(intervals, step_s)
     origin = expected[0][0]
-    start = np.array([(w[0] - origin).total_seconds() for w in expected])
-    end = np.array([(w[1] - origin).total_seconds() for w in expected])
+    start, end = (np.array([(w[k] - origin).total_seconds() for w in expected]) for k in (0, 1))
     at = seconds(o, origin)
     # dates in two doubles, and sums of days in seconds: a nanosecond
     within(at, (start + end) / 2.0, 1e-8)

@@ -37,12 +37,11 @@ def test_round_trip_is_exact(data, tmp_path):
     np.testing.assert_array_equal(here, there)
 
 
-def altered(change):
-    def write(data, path):
-        dataset = data.to_dataset()
-        (change(dataset) or dataset).to_netcdf(path, engine="h5netcdf")
-
-    return write
+def altered(data, folder, change):
+    """A file of the data, in which something was changed."""
+    dataset, path = data.to_dataset(), folder / "altered.nc"
+    (change(dataset) or dataset).to_netcdf(path, engine="h5netcdf")
+    return path
 
 
 SECOND = np.timedelta64(1, "s")
@@ -62,15 +61,12 @@ BAD_FILES = [
 
 @pytest.mark.parametrize(("change", "message"), BAD_FILES)
 def test_bad_files_are_refused(data, tmp_path, change, message):
-    path = tmp_path / "bad.nc"
-    altered(change)(data, path)
-    refuse(message, read_visibilities, path)
+    refuse(message, read_visibilities, altered(data, tmp_path, change))
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mK", 1e-3), ("kK", 1e3), ("", 1.0)])
 def test_temperatures_in_other_units_are_converted(data, tmp_path, unit, factor):
-    path = tmp_path / "other.nc"
-    altered(lambda d: d["visibility"].attrs.update(units=unit))(data, path)
+    path = altered(data, tmp_path, lambda d: d["visibility"].attrs.update(units=unit))
     np.testing.assert_allclose(read_visibilities(path).data, factor * data.data, rtol=1e-15)
 
 
@@ -80,10 +76,13 @@ SCALES = [("UTC", 0.0), ("tai", 37.0), ("TT", 69.184), ("tdb", 69.184)]
 
 @pytest.mark.parametrize(("scale", "s"), SCALES)
 def test_times_in_other_scales_are_brought_to_utc(data, tmp_path, scale, s):
-    path, said = tmp_path / "other.nc", {"jd1": {"scale": scale}, "jd2": {"scale": scale}}
-    altered(lambda d: [d[k].attrs.update(said[k]) for k in said] and d.drop_vars("time"))(
-        data, path
-    )
+
+    def rescaled(dataset):
+        for name in ("jd1", "jd2"):
+            dataset[name].attrs.update(scale=scale)
+        return dataset.drop_vars("time")
+
+    path = altered(data, tmp_path, rescaled)
     within((data.observation.times - read_visibilities(path).observation.times).sec, s, 2e-3)
 
 

@@ -51,8 +51,7 @@ def test_a_bar_of_small_numbers_states_them():
     figure = Figure()
     image = figure.subplots().imshow([[0.04, 0.3]], norm=LogNorm(0.03, 0.44))
     labels = drawing.colour_bar(figure, image, figure.axes[0]).ax.get_yticklabels()
-    shown = [float(one.get_text()) for one in labels]
-    assert {0.03, 0.05, 0.1, 0.2} <= set(shown)
+    assert {0.03, 0.05, 0.1, 0.2} <= {float(one.get_text()) for one in labels}
 
 
 def test_a_sky_of_one_mode_is_shown():

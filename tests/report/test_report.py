@@ -162,11 +162,8 @@ def test_what_the_data_do_not_tell_is_said(tmp_path):
 def test_a_page_without_groups(tmp_path, monkeypatch):
     """Noise that couples times, and an A that would be too large to judge its data one by one."""
     monkeypatch.setattr(left_out, "DENSE_BYTES", 0.0)
-    overrides = [
-        "lmax=4",
-        "observation.runs.0.cycles=0.1",
-        "noise.gain={sigma: 0.01, visibilities: model}",
-    ]
+    gains = "noise.gain={sigma: 0.01, visibilities: model}"
+    overrides = ["lmax=4", "observation.runs.0.cycles=0.1", gains]
     made = lb.run_map(lb.load_scenario("fiducial", overrides), tmp_path / "map")
     (channel,) = read_channels(made.folder / "diagnostics.nc")
     assert not channel.judged.groups
@@ -204,9 +201,8 @@ def in_browser(page: str, tmp_path, width: int, points) -> dict:
     flags += "--disable-background-networking --disable-component-update --disable-sync "
     flags += "--allow-file-access-from-files --virtual-time-budget=20000 --dump-dom "
     command = [CHROMIUM, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}"]
-    dom = subprocess.run(
-        [*command, f"file://{tmp_path / 'outer.html'}"], capture_output=True, text=True, timeout=120
-    ).stdout
+    command.append(f"file://{tmp_path / 'outer.html'}")
+    dom = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
     (told,) = re.findall(r'<pre id="out">(.*?)</pre>', dom, re.DOTALL)
     return json.loads(told)
 

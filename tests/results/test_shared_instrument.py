@@ -88,9 +88,8 @@ def test_errors_that_channels_have_in_common_are_not_averaged_away(rho):
     within(got, of_z @ of_z.T + weights @ scores @ weights.T, 1e-9)
     if rho == 1.0:
         noisy = 0.1 * (np.linalg.solve(k, t).T @ np.linalg.solve(k, t)) / 3.0
-        within(
-            got, np.linalg.inv(told @ np.linalg.solve(slopes @ slopes.T + noisy, told) + one), 1e-9
-        )
+        known = told @ np.linalg.solve(slopes @ slopes.T + noisy, told)
+        within(got, np.linalg.inv(known + one), 1e-9)
     if rho == 0.0:
         within(got, np.linalg.inv(3.0 * told + one), 1e-9)
 

@@ -173,12 +173,11 @@ def test_a_power_law_that_a_smooth_sky_contains_is_not_detected(order):
     assert 0.3 < np.sqrt(np.mean([(one.amplitude / one.std) ** 2 for one in limits])) < 1.3
 
 
-def test_templates_and_what_has_no_limit(tmp_path):
+def test_templates_and_what_has_no_limit(write):
     f = np.arange(5.0, 51.0)
     bent = spectrum_of(f, 1e5 * (1.0 + 0.5 * np.sin(f)), np.eye(len(f)))
     assert "raise --order" in signal_limit(bent, *named_template("constant")).sentence()
-    file = tmp_path / "dip.csv"
-    file.write_text("frequency_mhz,temperature_k\n10,0\n20,-0.02\n30,0\n")
+    file = write("frequency_mhz,temperature_k\n10,0\n20,-0.02\n30,0\n", "dip.csv")
     name, template = named_template(str(file))
     assert name == "dip, at its peak"
     np.testing.assert_array_equal(template(np.array([15.0, 31.0])), [-0.5, np.nan])

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from assertions import assert_same_map
-from commands import posterior_of, sky_draws_of
+from commands import posterior_of, sets, sky_draws_of
 
 import lusee_bayes as lb
 from lusee_bayes.core.engine import ThisProcess
@@ -22,8 +22,7 @@ pytest.importorskip("distributed")
 
 TWELVE = [12.0 + 2 * k for k in range(12)]
 SETTINGS = ["lmax=6", "observation.runs.0.cycles=0.1"]
-MAP = ["map", "fiducial", "--frequencies", "12:34:2", "--draws", "3"]
-MAP += [word for setting in SETTINGS for word in ("--set", setting)]
+MAP = ["map", "fiducial", "--frequencies", "12:34:2", "--draws", "3", *sets(*SETTINGS)]
 
 # listens to Ctrl-C even where the tests run in the background, which ignores it
 PROGRAM = """

@@ -63,9 +63,8 @@ def test_channels_of_different_days(tmp_path):
     made = lb.run_map(planned, tmp_path / "map", data=data).result
     assert "observed sky of each channel" in made.sky_spectrum().regions
     said = json.loads((tmp_path / "map" / "provenance.json").read_text())
-    assert (
-        said["first"][:10] == days[20.0] and said["last"] == data[1].observation.times[-1].isot[:19]
-    )
+    assert said["first"][:10] == days[20.0]
+    assert said["last"] == data[1].observation.times[-1].isot[:19]
 
 
 @pytest.mark.long
@@ -274,10 +273,8 @@ def test_sampled_unknowns_beside_joint_skies_are_those_of_the_map(tmp_path):
         here = [row for row in table if float(row["frequency_mhz"]) == mhz]
         mean = [*found["mean"][number], *(float(row["value"]) for row in here)]
         std = np.array([*found["std"][number], *(float(row["std"]) for row in here)])
-        values = [
-            *result.skies.reshape(2000, -1).T,
-            *(sites[r["unknown"]].values.ravel() for r in here),
-        ]
+        unknowns = [sites[row["unknown"]].values.ravel() for row in here]
+        values = [*result.skies.reshape(2000, -1).T, *unknowns]
         # some 1,000 independent draws: four and a half standard deviations
         assert np.abs((np.mean(values, 1) - mean) / std).max() < 0.15
         assert np.abs(np.std(values, 1) / std - 1.0).max() < 0.1

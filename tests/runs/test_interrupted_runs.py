@@ -16,7 +16,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from commands import content
+from commands import content, sets
 
 from lusee_bayes.core.files import MANIFEST, SCRATCH, locked, recover
 
@@ -87,7 +87,7 @@ class Command:
         return time.monotonic() - start
 
     def start(self, folder: Path, *more: str) -> subprocess.Popen:
-        options = [a for s in self.settings for a in ("--set", s) if self.name != "paper"]
+        options = [] if self.name == "paper" else sets(*self.settings)
         # the earlier run has another seed
         arguments = [*self.arguments, *options, *more, "--force", "-q", "-o", str(folder)]
         command = [sys.executable, "-c", DRIVER, " ".join(self.settings), *arguments]

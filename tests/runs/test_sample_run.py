@@ -20,7 +20,7 @@ import pandas as pd
 import pytest
 from arviz_stats.base import array_stats
 from assertions import raising, refuse
-from commands import assert_drawn, content, refused, run
+from commands import assert_drawn, content, refused, run, sets
 from reference_linear import z_of
 
 import lusee_bayes as lb
@@ -34,10 +34,10 @@ from lusee_bayes.sampling.hmc import CHUNK
 
 ROOT = Path(lb.__file__).resolve().parents[1]
 OVERRIDES = ["lmax=6", "observation.runs.0.cycles=0.1"]
-SMALL = ["fiducial", *(a for override in OVERRIDES for a in ("--set", override))]
-# what SETTINGS make of a scenario with seed 1
+SMALL = ["fiducial", *sets(*OVERRIDES)]
 # runs that are killed and resumed take a minute and more together
 pytestmark = pytest.mark.long
+# what SETTINGS make of a scenario with seed 1
 SAMPLER = lb.Sampler(chains=4, warmup=100, draws=1000, seed=1)
 SETTINGS = ["--chains", "4", "--warmup", "100", "--draws", "1000"]
 N_MODES, NSIDE = 49, 8

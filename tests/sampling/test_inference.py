@@ -33,9 +33,8 @@ N_DATA, N_MODES = 12, 9
 def small_model() -> lb.LinearGaussian:
     """Nine modes, correlated noise; posterior correlations of up to 0.9, widths 0.1 to 1.4."""
     rng = np.random.default_rng(11)
-    coupling = rng.normal(size=(N_DATA, N_MODES)) * np.linspace(3.0, 0.1, N_MODES)
     return lb.LinearGaussian(
-        jnp.asarray(coupling),
+        jnp.asarray(rng.normal(size=(N_DATA, N_MODES)) * np.linspace(3.0, 0.1, N_MODES)),
         lb.HarmonicPrior(jnp.asarray([4.0, 1.0, 2.0])),
         DenseCovariance(jnp.asarray(random_covariance(rng, N_DATA))),
     )

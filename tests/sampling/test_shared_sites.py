@@ -98,11 +98,8 @@ def test_coordinates_are_those_of_the_gaussian_given_all_channels(octaves):
     latent = ["10MHz/common", *few, *(f"{name}/own" for name in FREQUENCIES)]
     white = shared_sites.gaussian_of_sites(known, unknowns, FREQUENCIES, shared, latent)
     assert sorted(white.names) == sorted(latent)
-    at = {
-        f"{name}/{u}": 4 * k + j
-        for k, name in enumerate(FREQUENCIES)
-        for j, u in enumerate(("common", "smooth", "own"))
-    }
+    own = ("common", "smooth", "own")
+    at = {f"{name}/{u}": 4 * k + j for k, name in enumerate(FREQUENCIES) for j, u in enumerate(own)}
     numbers = [[at[s], at[s] + 1][: shape[0] if shape else 1] for s, shape in white.sites]
     numbers = np.concatenate(numbers)
     scale, middle = (np.tile(v, 3)[numbers] for v in ([0.2, 2.0, 1.0, 1.0], [3.0, 0.0, 0.0, 0.0]))

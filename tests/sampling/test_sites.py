@@ -177,10 +177,9 @@ def test_predictions_from_draws_of_z(gaussian, case):
     arguments, whitening = case
     posterior, n = gaussian.condition(arguments["data"]).posterior, 4000
     z = jax.random.normal(jax.random.key(3), (n, 9), dtype=jnp.float64)
-    free = {**arguments, "data": None}
     with programs.numpyro_promotion():
         predictive = infer.Predictive(whitened(program("sky"), whitening), {"sky_white": z})
-        drawn = predictive(jax.random.key(4), **free)
+        drawn = predictive(jax.random.key(4), **(arguments | {"data": None}))
     expected = np.asarray(whitening.mean) + np.asarray(z) @ np.asarray(whitening.root).T
     np.testing.assert_allclose(drawn["sky"], expected, rtol=1e-13, atol=1e-13)
     a = np.asarray(gaussian.coupling.dense())

@@ -84,11 +84,8 @@ def test_what_no_prior_is_is_refused():
     refuse("Cholesky factor: lower triangular, diagonal > 0", dense, dense_covariance())
     refuse("the prior mean has shape", dense, root, mean=np.zeros(9))
     refuse("the root of the prior.*NaN", dense, np.full((4, 4), np.nan))
-    refuse(
-        r"C_ell of the prior is -0\.5 at ell = 2: negative",
-        harmonic,
-        jnp.array([1.0, 1.0, -0.5, -1.0]),
-    )
+    negative = jnp.array([1.0, 1.0, -0.5, -1.0])
+    refuse(r"C_ell of the prior is -0\.5 at ell = 2: negative", harmonic, negative)
     refuse("prior spectrum.*NaN", harmonic, jnp.array([1.0, jnp.nan]))
     spectrum = jnp.asarray(SPECTRUM)
     refuse("ell = 2 the prior has a mean, but no variance", harmonic, spectrum, mean=MEAN)

@@ -79,11 +79,8 @@ def test_sampled_drifts_multiply_what_is_marginalised_once(other):
     experiment = lb.build(scenario)
     pieces, values = program_pieces(experiment), dict(true_values(experiment.setup))
     drawn = lb.GainDrift(values["gain_sigma"], values["gain_correlation_h"])
-    key, hours = (
-        gain_drifts.GainDrifts.own_key(jax.random.key(scenario.seed)),
-        experiment.setup.observation.hours,
-    )
-    values["gains"] = drawn.sample(key, hours)
+    key = gain_drifts.GainDrifts.own_key(jax.random.key(scenario.seed))
+    values["gains"] = drawn.sample(key, experiment.setup.observation.hours)
     model = pieces["gaussian"]()
     for one in pieces["systematics"]():
         if isinstance(one, systematic.Marginalised):

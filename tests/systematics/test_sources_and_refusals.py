@@ -62,12 +62,8 @@ def columns() -> np.ndarray:
     The data are all products of all times, products outside.
     """
     cas, fornax, polaris = (np.asarray(r) for r in setup_of().responses)
-    rows = [cas]
-    for block in range(3):
-        row = np.zeros_like(fornax)
-        row[:, 2 * block : 2 * block + 2] = fornax[:, 2 * block : 2 * block + 2]
-        rows.append(row)
-    return np.stack([r.reshape(-1) for r in [*rows, polaris]], axis=1)
+    blocks = [np.where(np.arange(6) // 2 == block, fornax, 0.0) for block in range(3)]
+    return np.stack([r.reshape(-1) for r in (cas, *blocks, polaris)], axis=1)
 
 
 def kelvin_steradian(flux_jy: float, frequency_mhz: float = 25.0) -> float:

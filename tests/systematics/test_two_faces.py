@@ -147,9 +147,8 @@ def test_a_map_with_found_drifts_is_that_of_hmc(tmp_path):
     both = [GAINS % (0.05, t, "posterior") for t in ("marginalised", "sampled")]
     marginal, sampled = (lb.load_scenario("fiducial", [*plain, *prior, t]) for t in both)
     posterior = lb.infer(lb.build(marginal)).posterior
-    drawn = lb.run_sample(
-        sampled, tmp_path / "run", sampler=lb.Sampler(chains=2, warmup=300, draws=600)
-    ).result
+    sampler = lb.Sampler(chains=2, warmup=300, draws=600)
+    drawn = lb.run_sample(sampled, tmp_path / "run", sampler=sampler).result
     sky = drawn[0].tree["posterior"]["sky"].values.reshape(-1, 25)
     assert np.abs((np.asarray(posterior.mean) - sky.mean(0)) / sky.std(0)).max() < 0.2
     within(np.sqrt(np.diag(np.asarray(posterior.covariance()))) / sky.std(0), 1.0, 0.15)
@@ -303,12 +302,12 @@ def test_the_program_of_gain_scales():
     n_times, noise = len(hours), np.diag(np.asarray(radiometer(setup).diagonal()))
     for x, p in enumerate(products):
         for y, q in enumerate(products):
-            shared = [(p.i == q.i) + (p.i == q.j) + (p.j == q.i) + (p.j == q.j)]
+            shared = (p.i == q.i) + (p.i == q.j) + (p.j == q.i) + (p.j == q.j)
             both = (p.i == q.i) * (p.j == q.j) + (p.i == q.j) * (p.j == q.i)
             rows = slice(x * n_times, (x + 1) * n_times)
             columns = slice(y * n_times, (y + 1) * n_times)
             signal = around[x][:, None] * around[y][None]
-            noise[rows, columns] += signal * c * (shared[0] + c * both)
+            noise[rows, columns] += signal * c * (shared + c * both)
     mean = np.repeat([1.0 + sigma**2 * (p.i == p.j) for p in products], n_times)
     a = mean[:, None] * np.asarray(setup.coupling.dense())
     s = np.asarray(setup.prior.variance())

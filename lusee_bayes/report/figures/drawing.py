@@ -239,8 +239,7 @@ def sky_panel(
 
 def sky_figure(title: str, *panel: object, **options: object) -> Figure:
     """A figure of one :func:`sky_panel`, as wide as a phone or half a page."""
-    places = {"left": 0.01, "right": 0.97, "bottom": 0.02, "top": 0.9}
-    figure, (axes,) = in_places((6.4, 3.0), **places)
+    figure, (axes,) = in_places((6.4, 3.0), left=0.01, right=0.97, bottom=0.02, top=0.9)
     sky_panel(axes, title, *panel, shrink=0.8, pad=0.03, **options)
     return figure
 

@@ -46,8 +46,7 @@ def data_vector(result: MapResult) -> Figure | None:
 
 def beams(result: MapResult) -> Figure | None:
     """An auto and two crosses from above: zenith at the centre, North up, horizon at the rim."""
-    details = result.channel.details
-    if details is None:
+    if (details := result.channel.details) is None:
         return None
     grid = HemisphereGrid.gauss_legendre(*details.patterns.shape[1:])
     places = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 0.82, "wspace": 0.04}

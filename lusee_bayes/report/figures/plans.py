@@ -90,8 +90,7 @@ def _marks(
             box = {"fc": "white", "ec": "none", "pad": 0.8}
             style = {"textcoords": "offset points", "va": "center", "fontsize": 8, "bbox": box}
             axes.annotate(text, (x, y), (7, 0), **style)
-    reference = getattr(mine[0], name)
-    if reference is not None:
+    if (reference := getattr(mine[0], name)) is not None:
         axes.axvline(reference, color=colour, lw=0.9, ls="--", zorder=0)
 
 
