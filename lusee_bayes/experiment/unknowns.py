@@ -28,7 +28,7 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
-from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, Square, Vector
+from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, Square
 from lusee_bayes.core.checks import with_error
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.core.trees import quantity
@@ -38,7 +38,7 @@ from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
 from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, Shared, Tied
-from lusee_bayes.linear.posterior import pixel_std
+from lusee_bayes.linear.posterior import Posterior, pixel_std
 from lusee_bayes.sky.galaxy import kelvin_steradian
 from lusee_bayes.systematics import context, gain_table
 from lusee_bayes.systematics.above_lmax import AboveLmax
@@ -437,14 +437,18 @@ class SkyAbove:
         Orthonormal directions of its departure from the prior, in prior standard deviations.
     amplitudes : AmplitudesOfSky
         Of all unknowns, and then along these directions.
+    mean, covariance : (few,) and (few, few) array
+        Along these directions, for any sky of the map.
     """
 
     directions: Float[np.ndarray, "above few"]
     amplitudes: AmplitudesOfSky
+    mean: Float[np.ndarray, " few"]
+    covariance: Float[np.ndarray, "few few_2"]
 
     @classmethod
-    def of(cls, setup: context.Setup, inference: Inference) -> SkyAbove | None:
-        """Find it in a solved model; None if that ends at lmax."""
+    def of(cls, setup: context.Setup, inference: Inference, wide: Posterior) -> SkyAbove | None:
+        """Find it in a solved model; None if that ends at lmax. ``wide`` allows any sky."""
         parts = [part.systematic for part in inference.systematics]
         roots = [part.root for part in parts if isinstance(part, AboveLmax)]
         if not roots:
@@ -452,7 +456,15 @@ class SkyAbove:
         lower = checked_cholesky("the prior above lmax", setup.above.covariance)
         directions = solve_lower(lower, setup.above.root[setup.prior.size :], transpose=False)
         columns = np.concatenate([*(part.columns for part in inference.expanded), *roots], axis=1)
-        return cls(directions, AmplitudesOfSky.of(inference.solution, columns))
+        amplitudes = AmplitudesOfSky.of(inference.solution, columns)
+        given = amplitudes.integrated(np.asarray(wide.mean), np.asarray(wide.covariance()))
+        few = slice(-directions.shape[1], None)
+        return cls(directions, amplitudes, given.mean[few], given.covariance[few, few])
+
+    @property
+    def told(self) -> float:
+        """Number of these directions that the data measure."""
+        return float((1.0 - np.diagonal(self.covariance)).sum())
 
 
 def in_common(unknowns: Unknowns | None, above: SkyAbove | None, tied: Tied, number: int) -> Shared:
@@ -475,7 +487,7 @@ def in_common(unknowns: Unknowns | None, above: SkyAbove | None, tied: Tied, num
         turn = np.eye(len(mean))[:, unknowns.shared]
         root = tied.prior_root[number, unknowns.among(tied)]
     if tied.above is not None:
-        alike = tied.above.strengths[number] * above.directions.T @ tied.above.directions
+        alike = tied.above.root(number, above.directions)
         turn = np.hstack([turn, np.pad(alike, ((len(mean) - len(alike), 0), (0, 0)))])
         root = block_diag(root, np.eye(alike.shape[1]))
     across = given.covariance @ turn
@@ -519,7 +531,7 @@ def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
 
 
 def given_data(table: pd.DataFrame, amplitudes: Amplitudes) -> pd.DataFrame:
-    """Add value and std to a table, from amplitudes in prior standard deviations (its own first)."""
+    """Add value and std to a table, from amplitudes in prior standard deviations, its own first."""
     mean, std = amplitudes.mean[: len(table)], amplitudes.std[: len(table)]
     value = table["expected"] + table["prior_std"] * mean
     return table.assign(value=value, std=table["prior_std"] * std)

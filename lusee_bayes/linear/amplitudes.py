@@ -73,7 +73,7 @@ Q that are the same for all, N(E, V) for the amplitudes becomes ::
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -92,6 +92,7 @@ from lusee_bayes.noise.covariance import LowRankFactor
 
 Skies = Float[np.ndarray, "skies modes"]
 PatternModes = Float[np.ndarray, "patterns modes"]
+Columns = Float[np.ndarray, "_ _"]
 
 
 # information about an amplitude, over all, that is none
@@ -442,6 +443,28 @@ class AlikeAbove:
         variances, vectors = np.linalg.eigh(alike @ alike.T)
         strengths = np.abs(vectors[:, -1]) * np.sqrt(variances[-1])
         return cls(every @ (axes[:, kept] / np.sqrt(shares[kept])), strengths)
+
+    def root(self, number: int, directions: Float[np.ndarray, "others n"]) -> Columns:
+        """R_k of a channel with these D_k."""
+        return self.strengths[number] * directions.T @ self.directions
+
+    def misfit(self, channels: Iterable[tuple[Columns, Vector, Square]]) -> float:
+        """What one x adds to the sum of chi^2 of channels with an x each: zero on average.
+
+        Parameters
+        ----------
+        channels : iterable of ((others, n), (n,), (n, n)) arrays
+            D_k, and mean and covariance of the amplitudes from the channel's own data.
+        """
+        one = np.eye(self.directions.shape[1])
+        precision, vector, square = one, np.zeros(len(one)), 0.0
+        for number, (directions, mean, covariance) in enumerate(channels):
+            root = self.root(number, directions)
+            inverse = np.linalg.inv(one - root.T @ root + root.T @ covariance @ root)
+            pull = inverse @ (root.T @ mean)
+            precision, vector = precision + inverse - one, vector + pull
+            square += mean @ root @ pull
+        return float(square - vector @ np.linalg.solve(precision, vector))
 
 
 @dataclass(frozen=True)

@@ -153,6 +153,8 @@ class ChannelData:
         Digests of all data behind the map.
     information : Information or None
         Information in all these data, if it is kept for updates with new data.
+    seen_above : float
+        Number of directions of the sky above lmax that its data measure, if there are others.
     departure : Departure or None
         Its sky's departure from the prior, and the error in common with other frequencies.
     """
@@ -185,6 +187,7 @@ class ChannelData:
     diagnosis: Diagnosis | None = None
     digests: tuple[str, ...] = ()
     information: Information | None = None
+    seen_above: float = 0.0
     departure: Departure | None = None
 
     def given(self, table: pd.DataFrame) -> ChannelData:

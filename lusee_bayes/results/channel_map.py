@@ -179,9 +179,17 @@ class Conditioned:
         return Unknowns.of(self.experiment, self.from_data)
 
     @cached_property
+    def split(self) -> Split:
+        """chi^2 of these data in its two parts."""
+        judge = self.judged.solution
+        return Split.of(judge.posterior, judge.chi2, self.from_data.model.n_data, judge.matrix)
+
+    @cached_property
     def above(self) -> SkyAbove | None:
         """The sky above lmax given the sky; None if the model ends there, or of earlier data."""
-        return None if self.onto else SkyAbove.of(self.experiment.setup, self.from_data)
+        if self.onto:
+            return None
+        return SkyAbove.of(self.experiment.setup, self.from_data, self.split.wide)
 
     @cached_property
     def expected(self) -> float:
@@ -290,9 +298,7 @@ class Conditioned:
                 found["fluxes"] = flux_table(experiment, inference)
         with stages("diagnostics"):
             if not (alone or thorough):
-                given = judge.posterior, judge.chi2, inference.model.n_data, judge.matrix
-                instrument = Split.of(*given, None if joint else self.expected).instrument
-                instrument = instrument.allowing(unused)
+                instrument = self.split.instrument.allowing(unused)
             if alone or thorough or instrument.p < DOUBTFUL:
                 left = residuals(judge, data, unused, learned=learned is not None)
                 instrument = left.split.instrument
@@ -317,6 +323,8 @@ class Conditioned:
             not_gaussian, harmless = validity.reach(experiment, inference, alone)
         fitting = experiment.fitting
         altitude = experiment.highest_altitude
+        if not alone and self.above is not None:
+            found["seen_above"] = self.above.told
         if not joint:
             found["departure"] = Departure.of(altitude, self.posterior, *self._shared())
         return ChannelData(

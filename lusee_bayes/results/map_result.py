@@ -96,6 +96,8 @@ class Components:
         Last correction of the mean, in standard deviations.
     mode : PositiveMode or None
         For positive skies.
+    misfit_above : float
+        What the common sky above lmax adds to chi^2 of the channels (:meth:`.AlikeAbove.misfit`).
     """
 
     prior: SpectralPrior
@@ -107,6 +109,7 @@ class Components:
     information_bits: float
     refinement: float
     mode: PositiveMode | None = None
+    misfit_above: float = 0.0
 
     @property
     def maps(self) -> Float[np.ndarray, "components modes"]:
@@ -188,14 +191,17 @@ class MapResult(Described):
     def fits(self) -> ChannelFits:
         """chi^2 of every channel, and the joint tests."""
         parts, joint = tuple(c.instrument for c in self.channels), self.joint is not None
+        above = self.joint.misfit_above if joint else 0.0
         chi2 = self.joint.chi2 if joint else float(self.stacked("chi2_model").sum())
-        chi2 -= sum(part.chi2 for part in parts)
+        chi2 -= sum(part.chi2 for part in parts) + above
         degrees = float(self.stacked("n_data").sum()) - sum(part.degrees for part in parts)
         # one sky in all channels: their parts may be as good as the same, and a mean is no surer
         n = 1 if joint else len(parts)
         prior = ChiSquare(chi2 / n, degrees / n)
         learned = any(c.log_evidence_learned is not None for c in self.channels)
-        return ChannelFits(self.frequencies_mhz, parts, prior, joint, self.shared_tests, learned)
+        seen_above = tuple(c.seen_above for c in self.channels)
+        more = joint, self.shared_tests, learned, seen_above, above
+        return ChannelFits(self.frequencies_mhz, parts, prior, *more)
 
     @cached_property
     def fit(self) -> Fit:

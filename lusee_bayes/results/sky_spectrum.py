@@ -12,9 +12,9 @@ Channels are solved with independent priors m = mu + G u, u ~ N(0, 1), but their
 Given z, with the covariance C_z, the error of m contains -E u with E = C_z G^-T: the structure that
 the data do not measure, which is nearly the same at all frequencies. rho_fg, the correlation of u
 at f and g, is measured: it is the product of the posterior means u', each divided by the root of
-u' K u', with the fraction K = 1 - G^-1 C G^-T that the data measure. The sky above lmax, x ~ N(0, 1)
-in prior standard deviations, is taken for structure of the map: the error contains -F x, where F is
-the covariance of m with x given z. Together these are at most the whole variance, so the matrix is
+u' K u', with the fraction K = 1 - G^-1 C G^-T that the data measure. The sky above lmax, with x in
+prior standard deviations, is taken for structure of the map: the error also contains -F x, with the
+covariance F of m and x given z. All terms together are at most the whole variance, so the matrix is
 positive definite.
 
 In a joint posterior the prior correlates the skies. L m_f is linear in the component maps and the

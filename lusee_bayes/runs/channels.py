@@ -675,15 +675,12 @@ def map_channels(
             seen = [changed.get(f, one) for f, one in zip(frequencies, seen, strict=True)]
         tied, tests = tie_channels(scenario, frequencies, [one.share for one in seen])
     if scenario.joint:
-        some = sorted({0, len(mapped) // 2, len(mapped) - 1})
-        above = [files.read(mapped[k], ChannelInformation).above for k in some]
-        if above[0] is not None:
-            alike = AlikeAbove.of([a.directions for a in above], np.stack([s.sky for s in seen]))
-            tied = replace(tied or Tied.of_nothing(len(mapped)), above=alike)
+        tied, misfit = _with_sky_above(tied, mapped, files, [one.sky for one in seen])
         at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
         components, posterior = solve_components(
             _without(unmapped, scenario), at_hand, seen, max(scenario.output.draws, N_DRAWS)
         )
+        components = replace(components, misfit_above=misfit)
 
     def finish(channel: Scenario) -> None:
         """Write the result of a channel, given the data of all channels."""
@@ -699,6 +696,23 @@ def map_channels(
         results = [replace(a, temperatures=b) for a, b in zip(results, regions, strict=True)]
     more = {"tie_log_evidence": 0.0 if tied is None else tied.log_evidence, "shared_tests": tests}
     return MapResult(scenario, tuple(results), components, stages.seconds, unmapped, **more)
+
+
+def _with_sky_above(
+    tied: Tied | None, channels: Sequence[Scenario], files: ChannelFiles, skies: list[SkyModes]
+) -> tuple[Tied | None, float]:
+    """Add the sky above lmax, if any, to what channels have in common, and its part of chi^2."""
+
+    def above(number: int) -> SkyAbove | None:
+        return files.read(channels[number], ChannelInformation).above
+
+    n = len(channels)
+    some = [above(k) for k in sorted({0, n // 2, n - 1})]
+    if some[0] is None:
+        return tied, 0.0
+    alike = AlikeAbove.of([one.directions for one in some], np.stack(skies))
+    each = ((one.directions, one.mean, one.covariance) for one in map(above, range(n)))
+    return replace(tied or Tied.of_nothing(n), above=alike), alike.misfit(each)
 
 
 def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:
