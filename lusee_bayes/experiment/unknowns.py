@@ -441,7 +441,7 @@ class SkyAbove:
         Along these directions, for any sky of the map.
     """
 
-    directions: Float[np.ndarray, "above few"]
+    directions: Float[np.ndarray, "others few"]
     amplitudes: AmplitudesOfSky
     mean: Float[np.ndarray, " few"]
     covariance: Float[np.ndarray, "few few_2"]

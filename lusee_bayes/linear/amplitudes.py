@@ -503,8 +503,9 @@ class Tied:
     @classmethod
     def of_nothing(cls, n_channels: int) -> Tied:
         """Of channels without common amplitudes."""
-        none = np.zeros((n_channels, 0))
-        return cls(none, none[..., None], none[0], none[..., None], none[None], 0.0)
+        none = np.zeros((n_channels, 0, 0))
+        mean = np.zeros((n_channels, 0))
+        return cls(mean, none, np.zeros(0), none, mean[None], 0.0)
 
     @property
     def start(self) -> Vector:

@@ -36,7 +36,7 @@ from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.results.channel import ChannelData, ChannelResult, Details, Judged
 from lusee_bayes.results.finished_runs import SavedInformation, taken
 from lusee_bayes.results.map_result import prior_sentence
-from lusee_bayes.results.sky_spectrum import Columns, Departure, RegionTemperatures, WithSky
+from lusee_bayes.results.sky_spectrum import Above, Columns, Departure, RegionTemperatures, WithSky
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference
 
@@ -326,7 +326,7 @@ class Conditioned:
         if not alone and self.above is not None:
             found["seen_above"] = self.above.told
         if not joint:
-            found["departure"] = Departure.of(altitude, self.posterior, *self._shared())
+            found["departure"] = Departure.of(altitude, self.posterior, *self._shared(alone))
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
             taken=taken(data.observation),
@@ -366,9 +366,10 @@ class Conditioned:
                 return None if other.level() == "does not fit" else other
         return None
 
-    def _shared(self) -> tuple[WithSky, Columns, Columns]:
+    def _shared(self, alone: bool) -> tuple[WithSky, Columns, Above]:
         """Covariance, w and above of :class:`.Departure`, in K^2 and K."""
-        unknowns, above, sources, n = self.unknowns, self.above, self.covariance[:0], 0
+        above = None if alone else self.above
+        unknowns, sources, n = self.unknowns, self.covariance[:0], 0
         shared, none = np.zeros(0, dtype=int), np.zeros((len(self.covariance), 0))
         if unknowns is None and above is None:
             return self.covariance, none, none

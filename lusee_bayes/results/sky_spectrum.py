@@ -51,6 +51,7 @@ Frequencies = Float[np.ndarray, " frequency"]
 Rows = Float[np.ndarray, "area mode"]
 WithSky = Float[np.ndarray, "mode_or_source mode"]
 Columns = Float[np.ndarray, "mode_or_source shared"]
+Above = Float[np.ndarray, "mode_or_source others"]
 
 # resolution of regions
 NSIDE = 64
@@ -109,7 +110,7 @@ class Departure:
         posterior: Posterior,
         covariance: WithSky,
         w: Columns,
-        above: Columns,
+        above: Above,
     ) -> Departure:
         """Compute it from a posterior given a channel's own data.
 
