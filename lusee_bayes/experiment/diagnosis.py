@@ -589,7 +589,8 @@ def _tried(judge: UnderAnySky, residuals: Residuals, unused: float = 0.0) -> Dia
     better = [replace(one, chi2=one.chi2.allowing(unused)) for one in better]
     better = sorted(better, key=lambda one: (-one.chi2.p, one.chi2.chi2))
     n_tried = len(of_data) + len(of_model) + len(others)
-    absent = [cls.key for cls in SYSTEMATICS if cls.treatment(setup.scenario) is None]
+    treatments = {cls.key: cls.treatment(setup.scenario) for cls in SYSTEMATICS}
+    absent = [key for key, treatment in treatments.items() if treatment in (None, "ignored")]
     absent = tuple(k for k in absent if k.startswith("noise.") and k != NoiseLevel.key)
     return Diagnosis(base.allowing(unused), tuple(_merged(better)), n_tried, absent)
 
@@ -648,6 +649,8 @@ def _offsets(
         remedy = f"give noise.pointing.{kind}"
         if section is not None and kind in section.kinds:
             remedy = f"widen its prior, noise.pointing.{kind}, or set treatment=sampled"
+            if section.treatment == "ignored":
+                remedy = "set noise.pointing.treatment=marginalised"
         words = f"{name} is off by {value:.3g}"
         yield chi2, ModelMistake(words, remedy, setup.beams, shifted(value))
 

@@ -116,7 +116,7 @@ class ChannelFits:
 
     @property
     def total_p(self) -> float:
-        """p of the total, which scatters more if channels see one sky above lmax that is unknown."""
+        """p of the total; it scatters more if channels see the same unknown sky above lmax."""
         share = 1.0 if self.joint else self.independent / len(self.channels)
         return ChiSquare(share * self.total.chi2, share * self.total.degrees).p
 

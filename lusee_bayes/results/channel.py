@@ -153,6 +153,8 @@ class ChannelData:
         Digests of all data behind the map.
     information : Information or None
         Information in all these data, if it is kept for updates with new data.
+    prior_of_all : ChiSquare or None
+        The part of chi^2 that tests the prior, with earlier data; None without these.
     seen_above : float
         Number of directions of the sky above lmax that its data measure, if there are others.
     departure : Departure or None
@@ -187,6 +189,7 @@ class ChannelData:
     diagnosis: Diagnosis | None = None
     digests: tuple[str, ...] = ()
     information: Information | None = None
+    prior_of_all: ChiSquare | None = None
     seen_above: float = 0.0
     departure: Departure | None = None
 

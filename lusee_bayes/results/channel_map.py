@@ -185,6 +185,13 @@ class Conditioned:
         return Split.of(judge.posterior, judge.chi2, self.from_data.model.n_data, judge.matrix)
 
     @cached_property
+    def split_of_all(self) -> Split:
+        """chi^2 of all data in its two parts."""
+        posterior, information = self.posterior, self.information
+        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+        return Split.of(posterior, chi2, int(information.n_data))
+
+    @cached_property
     def above(self) -> SkyAbove | None:
         """The sky above lmax given the sky; None if the model ends there, or of earlier data."""
         if self.onto:
@@ -221,9 +228,8 @@ class Conditioned:
         """Replace n_data and chi^2 by those of all data, which a joint posterior uses."""
         if not self.onto:
             return data
-        posterior, n_data = self.posterior, int(self.information.n_data)
-        chi2 = float(self.information.chi2(posterior.mean) + posterior.prior_chi2())
-        return replace(data, n_data=n_data, instrument=Split.of(posterior, chi2, n_data).instrument)
+        instrument = self.split_of_all.instrument
+        return replace(data, n_data=int(self.information.n_data), instrument=instrument)
 
     def compared(self) -> Float[np.ndarray, "more modes"] | None:
         """Draws minus the mean for :class:`.Counts`, in K; None if the truth is unknown."""
@@ -233,13 +239,14 @@ class Conditioned:
 
     def figures(self) -> dict[str, float | bool]:
         """Further arguments of :func:`channel_result`: numbers, and whether C is kept."""
-        model, posterior, data = self.from_all.model, self.posterior, self.experiment.data.data
+        posterior, judge = self.posterior, self.judged.solution
+        chi2 = float(judge.model.chi2(judge.posterior.mean, judge.data)) - judge.excess
         return {
             "log_evidence": float(posterior.log_evidence),
             "information_bits": float(posterior.information_bits()),
-            "chi2": float(model.chi2(posterior.mean, data)) - self.judged.solution.excess,
+            "chi2": chi2,
             "chi2_expected": self.expected,
-            "chi2_model": self.judged.solution.chi2,
+            "chi2_model": judge.chi2,
             "refinement": float(posterior.refinement),
             "covariance_kept": self.experiment.scenario.output.covariance,
         }
@@ -302,6 +309,9 @@ class Conditioned:
             if alone or thorough or instrument.p < DOUBTFUL:
                 left = residuals(judge, data, unused, learned=learned is not None)
                 instrument = left.split.instrument
+            if self.onto:  # the sky is the same, so its prior is judged by all data
+                prior = found["prior_of_all"] = self.split_of_all.prior
+                left = left and replace(left, split=replace(left.split, prior=prior))
             found["details"] = _details(self) if alone else None
         bad = left is not None and left.level() == "does not fit"
         if bad or thorough:

@@ -198,6 +198,8 @@ class MapResult(Described):
         # one sky in all channels: their parts may be as good as the same, and a mean is no surer
         n = 1 if joint else len(parts)
         prior = ChiSquare(chi2 / n, degrees / n)
+        if not joint and (known := [c.prior_of_all for c in self.channels])[0] is not None:
+            prior = ChiSquare(sum(k.chi2 for k in known) / n, sum(k.degrees for k in known) / n)
         learned = any(c.log_evidence_learned is not None for c in self.channels)
         seen_above = tuple(c.seen_above for c in self.channels)
         more = joint, self.shared_tests, learned, seen_above, above

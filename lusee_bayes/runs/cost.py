@@ -43,6 +43,8 @@ IN_ROUNDS, FIELD_ARRAYS = 3e5, 8
 COMPARING_OPERATIONS = 40
 # the sky above lmax: arrays of data, and floating-point operations in n_data n^2 + n^3
 ABOVE_ARRAYS, ABOVE_OPERATIONS = 1.5, 5
+# with drifting gains, arrays of data by data: of one run, of several
+GAIN_ARRAYS = 8.0, 12.5
 # arrays of pixels for the maps of a report, intermediate results included
 MAPS = 12
 # arrays of data for each source in the model
@@ -161,7 +163,8 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
     gain = scenario.noise.gain
     if gain is not None and gain.treatment == "marginalised":
         # N couples all times, so A is formed
-        squares += 3.0 * n_data**2 + 3.0 * n_data * n_modes
+        runs = len(scenario.observation.runs)
+        squares += GAIN_ARRAYS[runs > 1] * n_data**2 + 3.0 * n_data * n_modes
         operations += n_channels * (float(n_data) ** 3 + 2.0 * n_data * float(n_modes) ** 2)
     if scenario.sources.treatment != "ignored":
         n_sources = len(scenario.sources.list)

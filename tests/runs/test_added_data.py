@@ -73,12 +73,13 @@ def test_a_map_is_that_of_all_data(kind, tmp_path, exact_tilt, monkeypatch):
         for here, there in zip(both.channel.parameters, whole.channel.parameters, strict=True):
             assert here["value"] == pytest.approx(there["value"], abs=1e-3 * there["std"])
         assert both.channel.parameters != first.channel.parameters
+    # the prior is judged by all data
+    here, there = (r.channel.judged.prior if r.single else r.fits().prior for r in (both, whole))
+    assert here.chi2 == pytest.approx(there.chi2, rel=1e-3)
+    assert here.degrees == pytest.approx(there.degrees, rel=1e-3)
     if joint:
-        here, there = both.fits(), whole.fits()
-        for one, other in zip(here.channels, there.channels, strict=True):
+        for one, other in zip(both.fits().channels, whole.fits().channels, strict=True):
             assert one.chi2 == pytest.approx(other.chi2, rel=1e-4)
-        assert here.prior.chi2 == pytest.approx(there.prior.chi2, rel=1e-3)
-        assert here.prior.degrees == pytest.approx(there.prior.degrees, rel=1e-3)
     # and it can go on
     for channel in scenario.channels() or (scenario,):
         kept = read_information(information_file(tmp_path / "both"), channel)
