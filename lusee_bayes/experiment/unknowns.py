@@ -620,7 +620,8 @@ def _preferred(experiment: Experiment, result: Inference, values: dict[str, floa
     for name, template in zip(steps, per_unit.T, strict=True):
         for first, last, times in stretches:
             column = np.where(times[data.layout.time], template, 0.0)
-            if first < 0 or column.any():
+            # of all days together, the model has inferred its own offsets
+            if name not in values if first < 0 else column.any():
                 rows.append((name, first, last))
                 columns.append(column)
     table = pd.DataFrame(rows, columns=["offset", "first_day", "last_day"])

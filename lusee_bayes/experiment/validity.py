@@ -203,9 +203,9 @@ def reach(experiment: Experiment, inference: rounds.Inference, alone: bool = Tru
         more = f"What channels share of {keys} is not Gaussian: given all, errors may be too small."
         doubts += [more] * (not alone)
     if wrong or (alone and k > LARGEST_K):
-        hold = "do not hold" if wrong else "hold"
+        quite, hold = ("", "do not hold") if wrong else ("quite ", "hold")
         (doubts if wrong else notes).append(
-            f"The posterior of {keys} is not quite Gaussian. The map's errors {hold}: terms beyond "
+            f"The posterior of {keys} is not {quite}Gaussian. The map's errors {hold}: terms beyond "
             f"first order move it by {moved_by:.2g} of its standard deviations (rms; accepted: "
             f"{LARGEST_MOVE:g}), and the weights of draws have Pareto k = {k:.2g} (accepted: "
             f"{LARGEST_K:g}). treatment=sampled needs no Gaussian."

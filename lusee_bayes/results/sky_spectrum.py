@@ -347,7 +347,10 @@ class SkySpectrum:
         if self.truth is not None:
             columns["true"] = self.truth[k]
         columns = {f"{column} [{unit}]": scale * value for column, value in columns.items()}
-        most = [f"{self.sources[j]} {self.shares[j, k, i]:.0%}" for i, j in enumerate(self.most(k))]
+        most = [
+            f"{self.sources[j]} {share:.0%}" if (share := self.shares[j, k, i]) >= 0.005 else "-"
+            for i, j in enumerate(self.most(k))
+        ]
         cells = [[f"{value:,.1f}" for value in one] for one in columns.values()]
         mhz = [f"{value:g}" for value in self.frequency]
         header = ["MHz", *columns, "largest share from"]

@@ -339,7 +339,7 @@ class Averages:
         ]
         if self.bits is not None:
             fine, coarse = self.bits
-            lost = f"{fine - coarse:.2g} lost"
+            lost = f"{fine - coarse:.3g} lost"
             said.append(f"information about the map: {fine:.2f} bits -> {coarse:.2f} bits, {lost}")
         return tuple(said)
 
