@@ -4,8 +4,6 @@ A command imports its run only when called, so that ``--help`` and completion re
 The docstrings are the help text, in the subset that Markdown (terminal) and reST (site) share.
 """
 
-from __future__ import annotations
-
 import json
 import webbrowser
 from contextlib import nullcontext

@@ -4,8 +4,6 @@ Exit codes: 0 success; 1 a validation failed, workers were lost, or memory or di
 input (one sentence on standard error); 130 interrupted; 143 terminated.
 """
 
-from __future__ import annotations
-
 import atexit
 import gc
 import io

@@ -1,7 +1,5 @@
 """Tables that commands print."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 from rich.box import SIMPLE

@@ -10,8 +10,6 @@ JAX keeps compiled programs from one run to the next in the user's cache folder
 that is configured in JAX itself takes precedence.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import platform

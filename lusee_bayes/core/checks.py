@@ -6,8 +6,6 @@ pass; checks of dtype and shape still apply.
 A :class:`Described` object describes itself in about three lines, for a prompt or a notebook.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from typing import Any
 

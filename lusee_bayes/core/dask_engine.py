@@ -6,8 +6,6 @@ survives the end of any worker, of the scheduler or of the command. If a worker 
 its task elsewhere.
 """
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import logging

@@ -10,8 +10,6 @@ Smaller pieces of work run in up to one thread per processor (:func:`in_threads`
 each achieve more than two threads that share both processors for every matrix product.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 from abc import ABC, abstractmethod

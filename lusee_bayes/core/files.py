@@ -9,8 +9,6 @@ Runs check that results can be written before they compute anything (:func:`requ
 :func:`require_target`).
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import re

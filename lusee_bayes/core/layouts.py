@@ -7,8 +7,6 @@ numbers before they are used. Every error becomes one sentence with the name of 
 Files may state units (:func:`factor_to`). An error message points out Hz in place of MHz.
 """
 
-from __future__ import annotations
-
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@
 Any search through it finishes that module, in the middle of other imports. These are plain objects.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

@@ -9,8 +9,6 @@ through ctypes, which releases the lock. The lower triangle of an array in C ord
 triangle for LAPACK.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Iterator
 from functools import lru_cache

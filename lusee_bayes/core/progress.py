@@ -1,7 +1,5 @@
 """Progress of a run: the current stage, the time of each stage, and memory."""
 
-from __future__ import annotations
-
 import os
 import resource
 import sys

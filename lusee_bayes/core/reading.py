@@ -3,8 +3,6 @@
 This module reads JSON, CSV, NumPy's .npz and YAML (version 1.2, except that dates stay text).
 """
 
-from __future__ import annotations
-
 import csv
 import os
 import stat

@@ -1,7 +1,5 @@
 """Common parts of all sections of a scenario: types of entries, validators, kinds."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping
 from functools import reduce

@@ -5,8 +5,6 @@ integrates products of two harmonics with a field of band limit ``band`` exactly
 one matrix product per order m and one FFT per ring.
 """
 
-from __future__ import annotations
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -37,7 +35,7 @@ class SphereGrid(eqx.Module):
     n_phi: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, lmax: int, band: int) -> SphereGrid:
+    def of(cls, lmax: int, band: int) -> "SphereGrid":
         """Build the grid in NumPy.
 
         Parameters

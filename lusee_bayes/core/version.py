@@ -1,7 +1,5 @@
 """Origin of a result: versions of the package and its libraries, and the command line, if any."""
 
-from __future__ import annotations
-
 import subprocess
 from contextvars import ContextVar
 from functools import lru_cache

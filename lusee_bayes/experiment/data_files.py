@@ -1,7 +1,5 @@
 """Measured data of a scenario, from any supported file; sessions are reduced on reading."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path

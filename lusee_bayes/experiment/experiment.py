@@ -4,8 +4,6 @@ An :class:`Experiment` is a setup with its data, measured or simulated. It provi
 over the sky, and the pieces that programs can request.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace

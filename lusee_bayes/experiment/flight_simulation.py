@@ -4,8 +4,6 @@ This inverts :mod:`lusee_bayes.flight`: visibilities become spectra of all chann
 noise and disturbances, and spectra become counts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -7,8 +7,6 @@ Beams and receivers have one section per kind, selected by ``model``; those of r
 :class:`BaseBeamSection` here, with its :class:`BeamSource`, and add it to ``BEAM_SECTIONS``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -96,7 +94,7 @@ class ObservationSection(Section):
         return tree
 
     @model_validator(mode="after")
-    def _entries_agree(self) -> ObservationSection:
+    def _entries_agree(self) -> "ObservationSection":
         if self.fixed_axis and self.window != "instant":
             raise ValueError("fixed_axis is for samples that are instants; add window: instant")
         if self.schedule is None:

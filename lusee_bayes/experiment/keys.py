@@ -4,8 +4,6 @@ Units follow from the endings of names. Everything else is in ``Scenario.model_j
 which YAML editors also read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ radiometer noise, or every systematic. Simulated data come from the true instrum
 fluxes drawn with the scenario's seed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 

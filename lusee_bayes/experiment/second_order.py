@@ -21,8 +21,6 @@ posterior (Pareto k of Vehtari et al. 2024: up to 0.7). With hundreds of unknown
 many small second orders add up in w, but not in the map.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -83,7 +81,7 @@ class Draws(NamedTuple):
     beyond: Float[np.ndarray, "n data"]
 
     @classmethod
-    def of(cls, setup: Setup, inference: Inference, which: range) -> Draws | None:
+    def of(cls, setup: Setup, inference: Inference, which: range) -> "Draws | None":
         """Draw those with these numbers; None if no values were found in rounds."""
         parts = inference.expanded
         if not inference.moving or not isinstance(inference.solution.factor, LowRankFactor):

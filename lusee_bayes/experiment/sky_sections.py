@@ -5,8 +5,6 @@ that is a :class:`SkySource` or has a :class:`Prior`, and add it to ``SKY_SECTIO
 ``PRIOR_SECTIONS``. The prior on skies at several frequencies has a separate section.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

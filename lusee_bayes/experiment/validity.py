@@ -11,8 +11,6 @@ mean map by C A^T N^-1 T z. It raises the residual chi^2, the part that no sky c
 (the inverse with a very wide prior). Neither needs data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -205,10 +203,10 @@ def reach(experiment: Experiment, inference: rounds.Inference, alone: bool = Tru
     if wrong or (alone and k > LARGEST_K):
         quite, hold = ("", "do not hold") if wrong else ("quite ", "hold")
         (doubts if wrong else notes).append(
-            f"The posterior of {keys} is not {quite}Gaussian. The map's errors {hold}: terms beyond "
-            f"first order move it by {moved_by:.2g} of its standard deviations (rms; accepted: "
-            f"{LARGEST_MOVE:g}), and the weights of draws have Pareto k = {k:.2g} (accepted: "
-            f"{LARGEST_K:g}). treatment=sampled needs no Gaussian."
+            f"The posterior of {keys} is not {quite}Gaussian. The map's errors {hold}: terms "
+            f"beyond first order move it by {moved_by:.2g} of its standard deviations (rms; "
+            f"accepted: {LARGEST_MOVE:g}), and the weights of draws have Pareto k = {k:.2g} "
+            f"(accepted: {LARGEST_K:g}). treatment=sampled needs no Gaussian."
         )
     if alone and setup.measured:
         spots = blind_spots(setup, inference, inference.posterior.mean)

@@ -20,8 +20,6 @@ and the powers of two channels, averaged over many frames, have the covariance :
 Independent frames would give c_0(0)^2.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -76,7 +74,7 @@ class ChannelBand:
         averaging: Averaging,
         middles_mhz: Middles,
         shared_noise: tuple[float, ...] = (1.0,),
-    ) -> ChannelBand:
+    ) -> "ChannelBand":
         """Return the bins of a band.
 
         Parameters

@@ -17,8 +17,6 @@ are off together, are flagged. The noise is the radiometer's, or the scatter of 
 larger.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

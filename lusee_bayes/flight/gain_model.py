@@ -12,8 +12,6 @@ frequencies; beyond them no gain is defined. An auto in nV^2/Hz is counts / G, a
 counts / sqrt(G_a G_b).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
@@ -114,7 +112,7 @@ class GainModel(Described):
         spline = lazy.interpolate.CubicSpline(self.anchor_mhz[place], curves.T, extrapolate=False)
         return spline(frequencies_mhz).T
 
-    def with_component_std(self, std: tuple[float, ...] | None) -> GainModel:
+    def with_component_std(self, std: tuple[float, ...] | None) -> "GainModel":
         """Return the table with errors of the components of each level of each port, if given.
 
         Raises
@@ -260,7 +258,7 @@ CSV = Layout(
 HINT = "give the folder of luseepy's gain model (lusee/data/gain), or a netCDF file"
 
 
-def read_gain_table(path: str | Path, model: str = "quadratic") -> GainModel:
+def read_gain_table(path: str | Path, model: str = "quadratic") -> "GainModel":
     """Read a gain table.
 
     Parameters
@@ -293,7 +291,7 @@ def write_gain_table(path: str | Path, table: GainModel) -> Path:
 ARRAYS = {"freqs": ("anchor",), "mean": ("anchor",), "eigvecs": ("anchor", N_COMPONENTS)}
 
 
-def _read_folder(folder: Path, model: str) -> GainModel:
+def _read_folder(folder: Path, model: str) -> "GainModel":
     layout = {
         f"{place}_{name}": Variable(dims) for name, dims in ARRAYS.items() for place in PLACES
     }
@@ -354,7 +352,7 @@ TERMS = (
 LOW_MHZ, HIGH_MHZ = 0.2, 80.0
 
 
-def synthetic_gains() -> GainModel:
+def synthetic_gains() -> "GainModel":
     """Return a made-up table."""
     f = ANCHORS_MHZ
     shape = (f / (f + LOW_MHZ)) ** 2 / (1.0 + (f / HIGH_MHZ) ** 2)

@@ -1,7 +1,5 @@
 """Layout 3 of ``lusee.ingest``, in HDF5 and in FITS: the same with other names."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any

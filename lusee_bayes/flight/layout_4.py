@@ -5,8 +5,6 @@ telemetry with a separate clock, and a clock reference in place of an MJD offset
 to the names of layout 3.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

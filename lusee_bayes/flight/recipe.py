@@ -3,8 +3,6 @@
 The section ``flight`` of a scenario is defined here; a recipe is this section with its files read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

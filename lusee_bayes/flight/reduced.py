@@ -1,7 +1,5 @@
 """Spectra reduced to a number for each band, product and bin of time, with their flags."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -306,7 +304,7 @@ class Reduced(Described):
                 slope = std * self.gain_slope[band, port, r, bins]
                 yield f"{place} PC{r + 1}", np.where(at_level, slope, 0.0)
 
-    def without(self, band: int, gone: Bool[np.ndarray, "products bins"]) -> Reduced:
+    def without(self, band: int, gone: Bool[np.ndarray, "products bins"]) -> "Reduced":
         """Return the reduction without some values of a band, which do not fit the map."""
         values, n_averaged, reason = self.values.copy(), self.n_averaged.copy(), self.reason.copy()
         values[band][gone] = np.nan
@@ -338,7 +336,7 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
     return write_tree(path, reduced, formats.REDUCED, {"scenario": scenario})
 
 
-def read_reduced(path: str | Path) -> Reduced:
+def read_reduced(path: str | Path) -> "Reduced":
     """Read reduced spectra.
 
     Parameters

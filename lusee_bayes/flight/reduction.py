@@ -5,8 +5,6 @@ put into bands, each spectrum as a separate bin, and bursts are flagged; then th
 the final bins. In memory are the bands of one piece, and two slabs, the second being read ahead.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack

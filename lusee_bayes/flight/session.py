@@ -5,8 +5,6 @@ Facts of the spectrometer are from the flight software (lusee-night/coreloop: ``
 second, of which 4096 form a spectrum of 2048 channels, 25 kHz apart, every 40 microseconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field

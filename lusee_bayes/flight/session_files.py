@@ -4,8 +4,6 @@ Written files have all entries that :func:`read_session` and luseepy read, but n
 data of luseepy's sessions, such as waveforms and housekeeping packets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

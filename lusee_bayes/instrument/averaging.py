@@ -27,8 +27,6 @@ A bin's value is the mean of the remaining samples, weighted by live time; their
 bin's window. Empty bins are dropped.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import factorial, lgamma
 

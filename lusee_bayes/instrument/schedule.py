@@ -11,8 +11,6 @@ spectrometer takes data only in the mode ``science`` (``config/modes.yml`` and `
 there). Such a table has no turntable angles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache

@@ -22,8 +22,6 @@ interpolation of the response between its frequencies. Visibilities divided by s
 in K.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence

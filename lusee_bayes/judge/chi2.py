@@ -28,8 +28,6 @@ estimated variance. The rest, chi^2 - q, tests the prior. Weights lie between 0 
 scatter like a chi^2 with their means as degrees of freedom, or less.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
@@ -96,7 +94,7 @@ class ChiSquare:
             return "fainter, or closer to the prior's mean, than the prior assumes"
         return "inconsistent with the prior"
 
-    def allowing(self, unused: float) -> ChiSquare:
+    def allowing(self, unused: float) -> "ChiSquare":
         """The same if unknowns, of less than their prior's size, leave up to so many unused."""
         return ChiSquare(self.chi2, min(self.degrees, max(self.chi2, self.degrees - unused)))
 

@@ -1,7 +1,5 @@
 """Check whether the draws of chains can be trusted yet."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

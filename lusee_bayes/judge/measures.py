@@ -14,8 +14,6 @@ covariance minus the posterior covariance. Its square over that expectation is 1
 where the prior is too narrow, and smaller where it is too wide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

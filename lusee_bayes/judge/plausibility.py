@@ -1,7 +1,5 @@
 """Check whether data are plausible as correlations of a scenario's instrument under its sky."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -11,8 +11,6 @@ sees a part of the sky is not blamed for it. A bad group spoils the predictions 
 the culprit is the group whose removal makes the rest fit.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """chi^2 of data in two parts: one that no sky explains, and one that tests the prior."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -44,8 +42,7 @@ class Split:
         chi2: float,
         n_data: int,
         matrix: ModesMatrix | None = None,
-        expected: float | None = None,
-    ) -> Split:
+    ) -> "Split":
         """Split chi^2 of the data behind a posterior.
 
         Parameters
@@ -57,15 +54,13 @@ class Split:
         n_data : int
         matrix : (modes, modes) array, optional
             A^T N^-1 A, if it has been computed.
-        expected : float, optional
-            :func:`.expected_chi2`, if it has been computed.
 
         Raises
         ------
         InputError
             As :func:`widened`.
         """
-        n_known = n_data - (expected_chi2(posterior, n_data) if expected is None else expected)
+        n_known = n_data - expected_chi2(posterior, n_data)
         size = max(1.0, np.sqrt(float(posterior.prior_chi2()) / n_known)) if n_known > 0 else 1.0
         # data that do not fit require a sky that is brighter by orders of magnitude, under which
         # float64 cannot separate noise from sky; they stand out under narrower ones, too

@@ -408,7 +408,7 @@ REFINEMENTS = 2
 
 
 # common directions of the sky above lmax are those that this share of a channel's or more has
-LEAST_SHARE = 0.01
+LEAST_SHARE, TINY = 0.01, np.finfo(np.float64).tiny
 
 
 @dataclass(frozen=True)
@@ -437,11 +437,9 @@ class AlikeAbove:
         shares, axes = np.linalg.eigh(every.T @ every)
         kept = shares > LEAST_SHARE
         small = skies[:, n_modes(lmax_of(skies.shape[1]) // 2) :]
-        lengths = np.linalg.norm(small, axis=1, keepdims=True)
-        alike = np.full(small.shape, small.shape[1] ** -0.5)
-        alike = np.divide(small, lengths, out=alike, where=lengths > 0)
-        variances, vectors = np.linalg.eigh(alike @ alike.T)
-        strengths = np.abs(vectors[:, -1]) * np.sqrt(variances[-1])
+        small = small / np.maximum(np.linalg.norm(small, axis=1, keepdims=True), TINY)
+        left, sizes, _ = np.linalg.svd(small, full_matrices=False)
+        strengths = np.abs(left[:, 0]) * sizes[0]
         return cls(every @ (axes[:, kept] / np.sqrt(shares[kept])), strengths)
 
     def root(self, number: int, directions: Float[np.ndarray, "others n"]) -> Columns:

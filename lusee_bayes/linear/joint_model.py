@@ -8,8 +8,6 @@ It is differentiable by anything in A_f, N_f and the offsets, and can thus be sa
 which sums the information of many channels in NumPy, is :mod:`.joint`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -98,7 +96,7 @@ class JointModel(eqx.Module):
     @classmethod
     def of(
         cls, models: Sequence[LinearGaussian], data: Sequence[Array], prior: SpectralPrior
-    ) -> JointModel:
+    ) -> "JointModel":
         """Combine channels.
 
         Parameters

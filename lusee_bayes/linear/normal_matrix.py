@@ -18,8 +18,6 @@ Noise that couples times is whitened in order of time, a few rows of A at once. 
 NumPy, whatever kind of arrays A and N have.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

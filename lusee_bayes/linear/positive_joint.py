@@ -16,8 +16,6 @@ and tilt define a power law, which modes of low ell determine almost completely.
 are integrated out, with the power of the template.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable

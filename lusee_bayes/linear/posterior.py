@@ -4,8 +4,6 @@ The pixel variances of a map are diag(Y C Y^T), computed ring by ring; see
 :mod:`lusee_bayes.core.harmonics`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

@@ -19,8 +19,6 @@ other times, with exchanged products or the dependent responses of ideal dipoles
 as independent.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 

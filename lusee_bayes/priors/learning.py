@@ -33,8 +33,6 @@ drawn from the normal distribution about its most probable value, and skies from
 each S(theta(z)).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace

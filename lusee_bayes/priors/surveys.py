@@ -17,8 +17,6 @@ where E is the covariance of the learned deviations. Where the survey has no dat
 brighter than any sky is added.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

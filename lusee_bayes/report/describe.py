@@ -1,7 +1,5 @@
 """Recognising files and describing their contents."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass

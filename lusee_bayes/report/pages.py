@@ -1,7 +1,5 @@
 """report.html, the results of a run on one page, and pages that compare runs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

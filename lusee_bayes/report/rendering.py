@@ -6,8 +6,6 @@ and the origin of the data. It ends with links to its files, how to cite it, and
 scenario, versions, times, memory.
 """
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ The page has the coefficients of the skies and draws them at any NSIDE, for any 
 Standard deviations are stored as coarser pixels of two bytes, which it interpolates.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from typing import Any

@@ -4,8 +4,6 @@ A channel reports its distance from a known truth, by latitude and at some multi
 instrument, noise and prior agree with the data.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -193,7 +191,7 @@ class ChannelData:
     seen_above: float = 0.0
     departure: Departure | None = None
 
-    def given(self, table: pd.DataFrame) -> ChannelData:
+    def given(self, table: pd.DataFrame) -> "ChannelData":
         """Replace offsets and fluxes by those in a table of unknowns, given all channels."""
         pointing, fluxes = self.pointing, self.fluxes
         if pointing is not None and pointing.offsets is not None:

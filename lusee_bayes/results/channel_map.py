@@ -6,8 +6,6 @@ by group if requested or needed), unknowns, and the usual mistakes if the data d
 data or those of all channels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -58,7 +56,7 @@ BEAM_NODES, BEAMS = (48, 120), (0, 2, 1)
 
 def conditioned(
     experiment: Experiment, earlier: SavedInformation | None = None, stages: Stages | None = None
-) -> Conditioned:
+) -> "Conditioned":
     """Condition an experiment's model on its data, and on earlier data.
 
     Parameters

@@ -12,8 +12,6 @@ C = Lambda^-1 does not depend on d. It gives three numbers:
   sum_m mean^2 to sum_m (mean - m)^2, whose expectations are sum_m (S - C) and sum_m C.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ A map of one frequency has one channel. Several channels have independent poster
 posterior of component maps.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ A validation compares HMC and simulated data sets with the analytic posterior. I
 verdict.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -13,8 +13,6 @@ sky that needs one more term can look like the template, too, which chi^2 does n
 enough frequencies, the change of a with that term is part of its error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

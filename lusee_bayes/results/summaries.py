@@ -1,7 +1,5 @@
 """Contents of the JSON files in run folders: written by runs, read back by pages."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic import BaseModel, field_validator

@@ -47,7 +47,6 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import T
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.formats import says
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.trees import StoredTree, from_tree, write_tree
 from lusee_bayes.experiment.data_files import Data, anchored, digest_of
@@ -64,7 +63,6 @@ from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
 from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
-from lusee_bayes.results.sky_spectrum import N_DRAWS, Departure, combined
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import identity_of
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -100,7 +98,7 @@ class ChannelFiles:
     def kept(self, channel: Scenario, kind: type[T], make: Callable[[], T]) -> T:
         """Read the file if it is complete and of this run; otherwise make and write it."""
         path = self.path(channel, kind)
-        if says(path, {"identity": self.identity}):
+        if formats.says(path, {"identity": self.identity}):
             return self.read(channel, kind)
         made = make()
         write_tree(path, made, formats.CHANNEL, {"identity": self.identity})
@@ -113,18 +111,8 @@ class ChannelFiles:
             return from_tree(kind, StoredTree(file), str(path))
 
     def information(self, channel: Scenario, number: int, tied: Tied | None) -> Information:
-        """Read only the information of a :class:`ChannelInformation`, with tied unknowns if any."""
-        path = self.path(channel, ChannelInformation)
-        with h5py.File(path) as file:
-            tree = StoredTree(file)
-            information = from_tree(Information, tree.children["information"], str(path))
-            if tied is None:
-                return information
-            unknowns, above = (
-                from_tree(kind, tree.children[name], str(path)) if name in tree.children else None
-                for name, kind in (("unknowns", Unknowns), ("above", SkyAbove))
-            )
-        return in_common(unknowns, above, tied, number).information(information)
+        """Read the information of a :class:`ChannelInformation`, with common unknowns if any."""
+        return self.read(channel, ChannelInformation).whole(number, tied)
 
 
 @dataclass(frozen=True)
@@ -159,6 +147,12 @@ class ChannelInformation:
             share = Share.of(made)
         return cls(made.information, made.of_all(data), made.unknowns, made.above, sky, share)
 
+    def whole(self, number: int, tied: Tied | None) -> Information:
+        """The information, with what the channel has in common with the others, if anything."""
+        if tied is None:
+            return self.information
+        return in_common(self.unknowns, self.above, tied, number).information(self.information)
+
     def seen(self) -> Seen:
         """Inputs for the joint posterior: share, reference sky and model sky."""
         return Seen(self.share, np.asarray(self.information.reference), self.sky)
@@ -178,11 +172,8 @@ class ChannelInformation:
             The prior of the shared unknowns, which every channel then has.
         components : Components
         """
-        information, unknowns, data = self.information, self.unknowns, self.known
-        n, key, n_draws = information.n_modes, draw_key(scenario), scenario.output.draws
-        if tied is not None:
-            shared = in_common(unknowns, self.above, tied, number)
-            information = shared.information(information)
+        information, unknowns, data = self.whole(number, tied), self.unknowns, self.known
+        n, key, n_draws = self.information.n_modes, draw_key(scenario), scenario.output.draws
         draws, spread, common = components.draws, components.spread, None
         if (mode := components.mode) is not None:
             sky = positive_joint.positive_sky(mode, number, information, spread, draws, key)
@@ -193,6 +184,7 @@ class ChannelInformation:
         mean, covariance, drawn = sky.mean[:n], sky.covariance[:n, :n], sky.draws[:, :n]
         if unknowns is not None:
             if tied is not None:
+                shared = in_common(unknowns, self.above, tied, number)
                 given = unknowns.amplitudes if self.above is None else self.above.amplitudes
                 unknowns = unknowns.given_all(given.with_shared(shared, sky.mean, sky.covariance))
             data = data.given(unknowns.table(mean, covariance))
@@ -355,7 +347,7 @@ class Share:
     departure: Float[np.ndarray, " mode"] | None = None
 
     @classmethod
-    def of(cls, made: Conditioned, n_draws: int = 0, departure: Departure | None = None) -> Share:
+    def of(cls, made: Conditioned, n_draws: int = 0, data: ChannelData | None = None) -> Share:
         """Make it from a channel: its unknowns, and its posterior of the sky."""
         unknowns, inferred, above = made.unknowns, made.from_data, made.above
         amplitudes = unknowns.amplitudes if above is None else above.amplitudes
@@ -366,13 +358,13 @@ class Share:
         spread = posterior.covariance[np.ix_(shared, shared)]
         figures = n_draws, priors, inferred.fits, float(inferred.posterior.log_evidence)
         parts = octaves, unknowns.expected[shared] + posterior.mean[shared], spread, *figures
-        if departure is None:
+        if data is None:
             return cls(*parts)
         slopes = np.asarray(made.posterior.prior.whiten(-posterior.with_sky[:, shared].T))
         if above is not None:
             beyond = -posterior.covariance[shared, n:] @ above.directions.T
             slopes = np.concatenate([slopes, beyond], axis=1)
-        return cls(*parts, np.linalg.solve(spread, slopes), departure.mean)
+        return cls(*parts, np.linalg.solve(spread, slopes), data.departure.mean)
 
 
 class Seen(NamedTuple):
@@ -420,7 +412,7 @@ class ChannelAlone:
         deviations = made.draws - mean
         if compared is not None:
             deviations = np.concatenate([deviations, compared])
-        share = Share.of(made, len(deviations), data.departure)
+        share = Share.of(made, len(deviations), data)
         kept = made.covariance, deviations, made.figures(), share
         return cls(data, made.from_data.solution.information, made.unknowns, mean, *kept)
 
@@ -678,7 +670,10 @@ def map_channels(
         tied, misfit = _with_sky_above(tied, mapped, files, [one.sky for one in seen])
         at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
         components, posterior = solve_components(
-            _without(unmapped, scenario), at_hand, seen, max(scenario.output.draws, N_DRAWS)
+            _without(unmapped, scenario),
+            at_hand,
+            seen,
+            max(scenario.output.draws, sky_spectrum.N_DRAWS),
         )
         components = replace(components, misfit_above=misfit)
 
@@ -692,7 +687,7 @@ def map_channels(
         each(finish, mapped, "joint skies" if scenario.joint else "shared instrument")
     results = [files.read(channel, ChannelResult) for channel in mapped]
     if components is not None and components.mode is None:
-        regions = combined([result.temperatures for result in results], posterior)
+        regions = sky_spectrum.combined([result.temperatures for result in results], posterior)
         results = [replace(a, temperatures=b) for a, b in zip(results, regions, strict=True)]
     more = {"tie_log_evidence": 0.0 if tied is None else tied.log_evidence, "shared_tests": tests}
     return MapResult(scenario, tuple(results), components, stages.seconds, unmapped, **more)

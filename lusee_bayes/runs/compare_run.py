@@ -1,7 +1,5 @@
 """Comparisons: of finished map runs, and of one data set mapped under several priors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

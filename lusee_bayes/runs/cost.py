@@ -5,8 +5,6 @@ couples different times. A posterior with its diagnostics needs eight arrays of 
 peak. Factorisations take nearly all of the time.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

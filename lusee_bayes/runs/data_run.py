@@ -4,8 +4,6 @@ Sessions are files of the spectrometer, in luseepy's layout. Averages are means 
 times, reported with the information they lose.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A folder has the run's files, checksums, DataCite metadata, a licence and a read
 its texts are in ``report/templates/release``.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 from datetime import UTC, datetime

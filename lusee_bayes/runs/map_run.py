@@ -1,7 +1,5 @@
 """A map run: the posterior over the sky at one frequency, or at several."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import replace as replace_fields
 from pathlib import Path

@@ -6,8 +6,6 @@ at the same angles, so that a turn is compared with standing still for as long. 
 written to a file as soon as it is made.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Sequence

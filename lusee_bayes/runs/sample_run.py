@@ -4,8 +4,6 @@ A sampling run draws from the posterior of a NumPyro program. A validation compa
 simulated data sets with the analytic posterior.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Draws as an ArviZ DataTree, with every group of a sampled model, in netCDF."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

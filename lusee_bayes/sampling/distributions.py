@@ -9,8 +9,6 @@ They are ::
 with N of any structure.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 
 import jax

@@ -1,7 +1,5 @@
 """The fewest draws and simulations that a validation needs; imports nothing heavy."""
 
-from __future__ import annotations
-
 from lusee_bayes.core.errors import InputError
 
 # number of bins of a rank histogram, and simulations expected in each

@@ -15,8 +15,6 @@ quantities. Skies are draws (chains, draws, modes) of Galactic harmonic coeffici
 or :meth:`Posterior.sample`; maps are HEALPix RING, Galactic, in K.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ NumPyro runs under JAX's standard rules of types and ranks, the package under st
 (:func:`numpyro_promotion`).
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import re

@@ -13,8 +13,6 @@ Skies of a joint posterior are integrated out together (:mod:`.joint_model`): th
 evidences are left out, and one of all data takes their place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

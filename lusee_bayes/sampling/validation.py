@@ -21,8 +21,6 @@ The sampler's diagnostics have the usual limits (Vehtari et al. 2021; Betancourt
 R-hat, whose largest value among thousands of modes exceeds 1.01 by chance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -8,8 +8,6 @@ so S = sum_c s_c s_c^T (x) C^c + diag(R^f). The spectra are a power law, its cur
 turnover; the residual is the remainder.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
@@ -134,7 +132,7 @@ class SpectralPrior(checks.Described, eqx.Module):
         reference_mhz: float = 20.0,
         turnover_mhz: float = 5.0,
         residual: float | None = None,
-    ) -> SpectralPrior:
+    ) -> "SpectralPrior":
         """Fit components of ``SPECTRA`` times a power law to model skies.
 
         The components' C_ell are those of the fit.

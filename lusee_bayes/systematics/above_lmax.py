@@ -15,8 +15,6 @@ the data prefer (:func:`.variance_factor`).
 Simulated data contain the modes of the scenario's sky up to the same ell.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np
@@ -74,7 +72,7 @@ class AboveLmax(LowRankNoise):
     mean: DataVector
 
     @classmethod
-    def build(cls, section: AboveLmaxSection, setup: Setup, around: Around) -> AboveLmax:
+    def build(cls, section: AboveLmaxSection, setup: Setup, around: Around) -> "AboveLmax":
         return cls("above_lmax", setup.layout, *setup.above.seen)
 
     @classmethod

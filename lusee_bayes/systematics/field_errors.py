@@ -19,8 +19,6 @@ but never less than the expected strength: if parameters of the antennas describ
 the rest has only a few shapes, for which the strength of all would be far too low.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Annotated
 
@@ -105,7 +103,7 @@ class FieldErrors(ChangedBeams):
     expectation: FieldErrorsSection = eqx.field(static=True)
 
     @classmethod
-    def build(cls, section: FieldErrorsSection, setup: Setup, around: Around) -> FieldErrors:
+    def build(cls, section: FieldErrorsSection, setup: Setup, around: Around) -> "FieldErrors":
         band, values = setup.beams.lmax + 2 * section.lmax, around.values or {}
         grid, sky = sphere_grid.SphereGrid.of(band, band), HemisphereGrid.for_lmax(band)
         source, mhz = setup.beam_source, setup.frequency_mhz

@@ -10,8 +10,6 @@ expansion is about values and a sky that the data determine: then it is the Gaus
 mode of all unknowns.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import equinox as eqx
@@ -75,7 +73,7 @@ class GainTable(Systematic):
     layout: DataLayout
 
     @classmethod
-    def build(cls, section: GainTableSection, setup: Setup, around: Around) -> GainTable:
+    def build(cls, section: GainTableSection, setup: Setup, around: Around) -> "GainTable":
         """Use the errors that the data name, or one for each port.
 
         Raises

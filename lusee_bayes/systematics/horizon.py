@@ -27,8 +27,6 @@ with a horizon, beams are (runs, products, modes). The model neglects that terra
 with the lander, and that it hides point sources and the polarised sky.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Annotated
 
@@ -167,7 +165,7 @@ class Horizon(ChangedBeams):
         return np.inf
 
     @classmethod
-    def build(cls, section: HorizonSection, setup: Setup, around: Around) -> Horizon:
+    def build(cls, section: HorizonSection, setup: Setup, around: Around) -> "Horizon":
         source, beams = setup.beam_source, setup.beams
         ahead = np.radians(np.array(setup.observation.turntable_deg))[:, None]
         azimuth = np.pi / 2.0 - ahead - 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS

@@ -3,8 +3,6 @@
 There is no Gaussian term for a factor of a variance: if marginalised, the level stays at one.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -70,7 +68,7 @@ class NoiseLevel(Scale):
         return None if scenario.noise.radiometer.log_factor_std is None else "sampled"
 
     @classmethod
-    def build(cls, section: RadiometerSection, setup: Setup, around: Around) -> NoiseLevel:
+    def build(cls, section: RadiometerSection, setup: Setup, around: Around) -> "NoiseLevel":
         return cls((Unknown("noise_level", 1.0, section.log_factor_std, log=True),))
 
     def effect(self, model, values):

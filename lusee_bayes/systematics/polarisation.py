@@ -32,8 +32,6 @@ References
 Zaldarriaga and Seljak 1997, PRD 55, 1830; Kamionkowski, Kosowsky and Stebbins 1997, PRD 55, 7368.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import numpy as np
@@ -97,7 +95,7 @@ class Polarisation(LowRankNoise):
         return section.treatment if some else None
 
     @classmethod
-    def build(cls, section: PolarisationSection, setup: Setup, around: Around) -> Polarisation:
+    def build(cls, section: PolarisationSection, setup: Setup, around: Around) -> "Polarisation":
         grid, lmax = beam_fields.HemisphereGrid.for_lmax(section.lmax), section.lmax
         with reading.naming(cls.key):
             fields = setup.beam_source.fields(setup.beams.frequency_mhz, grid)

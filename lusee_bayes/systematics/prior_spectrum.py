@@ -4,8 +4,6 @@ There is no Gaussian term for them: if marginalised, they stay at their medians.
 not depend on them.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -80,7 +78,7 @@ class PriorSpectrum(Scale):
         return "sampled" if scenario.prior.samples else None
 
     @classmethod
-    def build(cls, section: SpectrumSection, setup: Setup, around: Around) -> PriorSpectrum:
+    def build(cls, section: SpectrumSection, setup: Setup, around: Around) -> "PriorSpectrum":
         sites, n_bands = [], len(section.band_edges) + 1
         if section.log_amplitude_std is not None:
             sites.append(Unknown("amplitude", 1.0, section.log_amplitude_std, log=True))

@@ -4,8 +4,6 @@ The mean power is part of the background, and so of the radiometer noise; the un
 port's deviations from it.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import jax
@@ -89,7 +87,7 @@ class Receivers(Temperatures):
         return section.smooth_octaves or 0.0
 
     @classmethod
-    def build(cls, section: ReceiverNoiseSection, setup: Setup, around: Around) -> Receivers:
+    def build(cls, section: ReceiverNoiseSection, setup: Setup, around: Around) -> "Receivers":
         powers = section.powers(setup.beam_source, setup.frequency_mhz)
         on_auto = np.asarray(setup.layout.product)[:, None] == auto_indices(len(powers))[None]
         sites = [f"receiver_{port}_k" for port in range(len(powers))]

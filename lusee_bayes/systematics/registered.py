@@ -3,8 +3,6 @@
 To add one, add a file beside this one, and a line here.
 """
 
-from __future__ import annotations
-
 from operator import attrgetter
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Temperature of the ground, whose emission is in every product."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

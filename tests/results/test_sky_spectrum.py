@@ -205,7 +205,7 @@ def test_skies_that_are_alike_have_errors_that_are_alike():
     std, zero = np.sqrt([row**2 @ c]), np.zeros(1)
     channel = sp.RegionTemperatures(*given, zero, std, None, none, none.T, none.T, None)
     measured = [mean / np.sqrt(mean**2 @ (1.0 - c)) for mean in means[0]]
-    departures = [sp.Departure(mean, (row * c)[None]) for mean in measured]
+    departures = [sp.Departure(mean, (row * c)[None], none) for mean in measured]
     each = [(mhz, channel, one) for mhz, one in zip([10.0, 11.0], departures, strict=True)]
     covariance = sp.SkySpectrum.of(each).covariance[0]
     # 1 / sqrt(4000) of the draws, 1 / sqrt(150) of the measured correlation; three of each

@@ -1,7 +1,5 @@
 """Small Gaussian models as dense matrices, and means of draws against what is known otherwise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -48,7 +46,7 @@ class Case:
     data: np.ndarray
 
     @classmethod
-    def drawn(cls, base, n_data, seed, noise, level=1.0, amplitude=1.0, tilt=0.0) -> Case:
+    def drawn(cls, base, n_data, seed, noise, level=1.0, amplitude=1.0, tilt=0.0) -> "Case":
         """Data of a random A; N is too small by a factor ``level``."""
         rng, base = np.random.default_rng(seed), np.asarray(base)
         a = rng.normal(size=(n_data, len(base) ** 2))

@@ -86,7 +86,6 @@ def test_the_text_that_was_digested_is_the_one_that_runs(write, monkeypatch, byt
 def test_a_program_may_hold_dataclasses_and_modules(write):
     """Both look up the module that they are defined in."""
     path = write(
-        "from __future__ import annotations\n"
         "from dataclasses import dataclass\n"
         "import equinox as eqx\n"
         "@dataclass\n"

@@ -16,8 +16,6 @@ antennas, gives V_k(t) = x B_k(n(t)) (:func:`source_response`). It rises and set
 move.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -191,7 +189,7 @@ class Monopoles(BeamSource, eqx.Module):
     def parameters(self) -> dict[str, Parameter]:
         return {n: Parameter(where(self), *ends) for n, (where, *ends) in PARAMETERS.items()}
 
-    def with_values(self, values: Mapping[str, float | Float[Array, ""]]) -> Monopoles:
+    def with_values(self, values: Mapping[str, float | Float[Array, ""]]) -> "Monopoles":
         changed = self
         for name, value in values.items():
             self.parameter(name)

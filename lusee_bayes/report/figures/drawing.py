@@ -9,8 +9,6 @@ beam that falls to a tenth at lmax reduces the rings to the per cent level. It a
 figures; files and numbers are unsmoothed.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Figures that test data: residuals, pointing, unknowns, and sessions with flags."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes

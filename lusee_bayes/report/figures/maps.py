@@ -1,7 +1,5 @@
 """Figures of maps, spectra and fidelity for a channel, a cube, or several finished runs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple
 from itertools import cycle

@@ -1,7 +1,5 @@
 """Figures that compare forecasts."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes

@@ -1,7 +1,5 @@
 """Figures of chains and draws: diagnostics and results."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import arviz_base
