@@ -40,6 +40,7 @@ from lusee_bayes.systematics.beam import beam_rms_difference
 
 STRONGER_ABOVE = """The sky above lmax is not as its prior expects: data fit only if any is allowed
 there, and error bars may be too small. Raise lmax, or use prior.model=local_scales."""
+APART = "With earlier data, each channel has its own sky above lmax: errors may be too small."
 # standard deviation of modes without prior variance, relative to the widest
 EXACT = 1e-12
 # of several channels, groups of data are tested where p of instrument and noise is below this
@@ -331,10 +332,9 @@ class Conditioned:
             not_gaussian, harmless = validity.reach(experiment, inference, alone)
         fitting = experiment.fitting
         altitude = experiment.highest_altitude
-        if not alone and self.above is not None:
-            found["seen_above"] = self.above.told
         if not joint:
             found["departure"] = Departure.of(altitude, self.posterior, *self._shared(alone))
+        stronger += (APART,) * (joint and self.onto and experiment.setup.above is not None)
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
             taken=taken(data.observation),
@@ -359,6 +359,7 @@ class Conditioned:
             notes=(*notes, *harmless),
             digests=self.digests,
             information=self.kept if scenario.output.information else None,
+            seen_above=0.0 if alone or self.above is None else self.above.told,
             **found,
         )
 
