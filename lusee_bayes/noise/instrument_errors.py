@@ -48,8 +48,6 @@ Hours = Float[Array, " times"]
 
 # C_g is dropped below double precision relative to sigma_g^2: exp(-x^2 / 2) = eps
 REACH = float(np.sqrt(-2.0 * np.log(np.finfo(np.float64).eps)))
-# number of grid times in the shortest correlation time
-PER_CORRELATION = 4.0
 
 
 class GainDrift(eqx.Module):
@@ -188,7 +186,7 @@ class GainDrift(eqx.Module):
 
 
 def white_grid(
-    hours: Hours, shortest_h: float, longest_h: float, *, margin: float = REACH
+    hours: Hours, shortest_h: float, longest_h: float, *, points: float = 4.0, margin: float = REACH
 ) -> Float[np.ndarray, " grid"]:
     """Return a grid of times for :meth:`GainDrift.history`.
 
@@ -198,6 +196,8 @@ def white_grid(
         Times of the samples.
     shortest_h, longest_h : float
         Range of correlation times in hours that the grid serves.
+    points : float
+        Number of grid times in the shortest correlation time.
     margin : float
         Reach of the grid beyond the samples, in longest correlation times.
 
@@ -208,7 +208,7 @@ def white_grid(
     """
     hours = np.asarray(hours)
     first, end = hours.min() - margin * longest_h, hours.max() + margin * longest_h
-    return np.arange(first, end, shortest_h / PER_CORRELATION)
+    return np.arange(first, end, shortest_h / points)
 
 
 def with_gains(visibilities: Grid, gains: Gains) -> Grid:

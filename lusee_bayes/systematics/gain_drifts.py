@@ -179,8 +179,7 @@ class GainDrifts(systematic.Systematic):
                 f"noise.gain.correlation_h is {ends[0]:.3g} h at least, too short for "
                 f"{hours[-1] - hours[0]:.4g} h of data; use noise.radiometer.factor"
             )
-        options = {"per_correlation": PER_CORRELATION, "margin": MARGIN}
-        grid = instrument_errors.white_grid(hours, *ends, **options)
+        grid = instrument_errors.white_grid(hours, *ends, points=PER_CORRELATION, margin=MARGIN)
         widths, stds = (drift.width(hours), longest.width(hours)), (log_sigma_std, log_std)
         times = jnp.asarray(hours), jnp.asarray(grid)
         return cls(drift, visibilities, *times, layout, *widths, *stds)

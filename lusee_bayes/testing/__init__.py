@@ -403,6 +403,7 @@ def check_sky_source(
     lmax: int,
     slice_rtol: float,
     missing_mhz: float | None = None,
+    missing_lmax: int | None = None,
 ) -> None:
     """Check the laws that every source of skies obeys.
 
@@ -418,6 +419,8 @@ def check_sky_source(
         coefficients; for maps, aliasing from above lmax in iterated quadrature.
     missing_mhz : float, optional
         A frequency in MHz at which it has no sky.
+    missing_lmax : int, optional
+        An ell up to which it has no sky.
     """
     sky = source.at(frequency_mhz, lmax)
     modes = np.asarray(sky.modes)
@@ -428,8 +431,9 @@ def check_sky_source(
     smaller = np.asarray(source.at(frequency_mhz, lmax // 2).modes)
     assert smaller.size == n_modes(lmax // 2)
     assert np.linalg.norm(smaller - modes[: smaller.size]) <= slice_rtol * np.linalg.norm(smaller)
-    if missing_mhz is not None:
-        assert_refused(lambda: source.at(missing_mhz, lmax))
+    for frequency, highest in ((missing_mhz, lmax), (frequency_mhz, missing_lmax)):
+        if frequency is not None and highest is not None:
+            assert_refused(lambda f=frequency, ell=highest: source.at(f, ell))
 
 
 def small_scenario(*overrides: str, lmax: int = 6, cycles: float = 0.02) -> Scenario:
