@@ -439,12 +439,15 @@ class SkyAbove:
         Of all unknowns, and then along these directions.
     mean, covariance : (few,) and (few, few) array
         Along these directions, for any sky of the map.
+    model : (others,) array
+        The model sky's departure.
     """
 
     directions: Float[np.ndarray, "others few"]
     amplitudes: AmplitudesOfSky
     mean: Float[np.ndarray, " few"]
     covariance: Float[np.ndarray, "few few_2"]
+    model: Float[np.ndarray, " others"]
 
     @classmethod
     def of(cls, setup: context.Setup, inference: Inference, wide: Posterior) -> SkyAbove | None:
@@ -453,13 +456,15 @@ class SkyAbove:
         roots = [part.root for part in parts if isinstance(part, AboveLmax)]
         if not roots:
             return None
-        lower = checked_cholesky("the prior above lmax", setup.above.covariance)
-        directions = solve_lower(lower, setup.above.root[setup.prior.size :], transpose=False)
+        above, n = setup.above, setup.prior.size
+        lower = checked_cholesky("the prior above lmax", above.covariance)
+        own = np.column_stack([above.root[n:], above.modes - above.mean[n:]])
+        directions, model = np.split(solve_lower(lower, own, transpose=False), [-1], axis=1)
         columns = np.concatenate([*(part.columns for part in inference.expanded), *roots], axis=1)
         amplitudes = AmplitudesOfSky.of(inference.solution, columns)
         given = amplitudes.integrated(np.asarray(wide.mean), np.asarray(wide.covariance()))
         few = slice(-directions.shape[1], None)
-        return cls(directions, amplitudes, given.mean[few], given.covariance[few, few])
+        return cls(directions, amplitudes, given.mean[few], given.covariance[few, few], model[:, 0])
 
     @property
     def told(self) -> float:

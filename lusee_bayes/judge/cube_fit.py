@@ -3,7 +3,9 @@
 The chi^2 that no sky explains (:mod:`.chi2`) is computed for each channel, independently of the
 prior and of whether channels share a posterior. Channels are independent: their chi^2 add up, and
 each is above its median with a probability of one half. The sum and the number above the median
-reveal excesses too small to be seen in single channels, such as 38 of 46 channels above.
+reveal excesses too small to be seen in single channels, such as 38 of 46 channels above. If the
+model has a sky above lmax, nearly the same in all channels, its part of chi^2 varies in all alike:
+with k of n degrees of freedom, c channels count as c / (1 + (c - 1) k / n) independent ones.
 
 The rest of chi^2 of all data under the model tests the prior. Channels see one sky, whose departure
 from the prior is much the same in all: without a joint prior, its mean over channels is judged like
@@ -88,9 +90,6 @@ class ChannelFits:
         Whether priors were learned from these data.
     seen_above : tuple of float
         Of each channel, degrees of freedom of the sky above lmax, which are common to channels.
-    misfit_above : float
-        What this sky adds to the sum of chi^2 because it is the same in all channels of a joint
-        posterior, which knows it.
     """
 
     frequencies_mhz: Float[np.ndarray, " channels"]
@@ -100,25 +99,17 @@ class ChannelFits:
     shared: tuple[SharedTest, ...] = ()
     learned: bool = False
     seen_above: tuple[float, ...] = ()
-    misfit_above: float = 0.0
 
     @property
     def total(self) -> ChiSquare:
         """chi^2 of all channels together."""
-        chi2 = sum(c.chi2 for c in self.channels) + self.misfit_above
-        return ChiSquare(chi2, sum(c.degrees for c in self.channels))
+        return ChiSquare(sum(c.chi2 for c in self.channels), sum(c.degrees for c in self.channels))
 
     @property
     def independent(self) -> float:
         """Number of independent channels whose sum scatters as much as that of these."""
         n = len(self.channels)
         return n / (1.0 + (n - 1.0) * sum(self.seen_above) / self.total.degrees)
-
-    @property
-    def total_p(self) -> float:
-        """p of the total; it scatters more if channels see the same unknown sky above lmax."""
-        share = 1.0 if self.joint else self.independent / len(self.channels)
-        return ChiSquare(share * self.total.chi2, share * self.total.degrees).p
 
     def p(self) -> Float[np.ndarray, " channels"]:
         """Probability of every channel's chi^2, two-sided."""
@@ -134,14 +125,16 @@ class ChannelFits:
         p, n = self.p(), len(self.channels)
         least = int(np.argmin(p))
         above = sum(bool(chdtrc(one.degrees, one.chi2) < 0.5) for one in self.channels)
-        # of as many channels as are independent
+        # of as many channels as are independent: the sum scatters more, too
+        share = self.independent / n
+        whole = ChiSquare(share * self.total.chi2, share * self.total.degrees).p
         apart = max(1, round(self.independent))
         signs = min(1.0, 2.0 * float(bdtr(min(above, n - above) * apart // n, apart, 0.5)))
         name = "prior" if self.joint else "prior, mean over channels"
         of_prior = self.prior.p_of_prior(self.learned)
         where = f"{self.frequencies_mhz[least]:g} MHz, {self.channels[least].chi2_words()}"
         return [
-            JointTest("sum over all channels", self.total_p, 1, self.total.chi2_words()),
+            JointTest("sum over all channels", whole, 1, self.total.chi2_words()),
             JointTest("channels above the median", signs, 1, f"{above} of {n}"),
             JointTest("most deviant channel", float(p[least]), n, where),
             JointTest(name, of_prior, 1, self.prior.chi2_words(), of_prior=True),

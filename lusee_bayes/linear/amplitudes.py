@@ -65,10 +65,12 @@ the sky give ln p(d | m, w) = ln p(d | m) + ln p(z | m, d) - ln N(z; 0, 1), i.e.
 
 *The sky above lmax* is nearly the same in all channels, too. Its departure x_k from the prior, in
 prior standard deviations, is seen along orthonormal directions D_k, as templates with amplitudes
-D_k^T x_k. With x_k = s_k x + (what differs by channel), x ~ N(0, 1), and w = Q^T x along directions
-Q that are the same for all, N(E, V) for the amplitudes becomes ::
+D_k^T x_k. With x_k = sum_j s_kj x_j + (what differs by channel), x_j ~ N(0, 1), and w_j = Q^T x_j
+along directions Q that are the same for all, N(E, V) for the amplitudes becomes ::
 
-    N(R_k^T E, 1 - R_k^T (1 - V) R_k)  for w,    R_k = s_k D_k^T Q.
+    N(R_k^T E, 1 - R_k^T (1 - V) R_k)  for w,    R_k = (s_k1 D_k^T Q, s_k2 D_k^T Q ...).
+
+The factors s_kj are those of the correlation of model skies.
 """
 
 from __future__ import annotations
@@ -84,7 +86,6 @@ from scipy.linalg import cho_solve
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Square, Vector
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import Solution
@@ -409,6 +410,8 @@ REFINEMENTS = 2
 
 # common directions of the sky above lmax are those that this share of a channel's or more has
 LEAST_SHARE, TINY = 0.01, np.finfo(np.float64).tiny
+# at most so many factors, each with at least this variance, of one in every channel
+MOST_FACTORS, LEAST_FACTOR = 3, 0.1
 
 
 @dataclass(frozen=True)
@@ -419,32 +422,38 @@ class AlikeAbove:
     ----------
     directions : (others, few) array
         Q.
-    strengths : (channels,) array
+    strengths : (channels, factors) array
         s_k.
     """
 
     directions: Float[np.ndarray, "others few"]
-    strengths: Float[np.ndarray, " channels"]
+    strengths: Float[np.ndarray, "channels factors"]
 
     @classmethod
     def of(
         cls,
         directions: Sequence[Float[np.ndarray, "others _"]],
-        skies: Float[np.ndarray, "channels modes"],
+        model: Float[np.ndarray, "channels others"],
     ) -> AlikeAbove:
-        """Find it from some channels' D_k, and from model skies, whose small scales tell s_k."""
+        """Find it from some channels' D_k, and from x_k of model skies."""
         every = np.concatenate(directions, axis=1)
         shares, axes = np.linalg.eigh(every.T @ every)
         kept = shares > LEAST_SHARE
-        small = skies[:, n_modes(lmax_of(skies.shape[1]) // 2) :]
-        small = small / np.maximum(np.linalg.norm(small, axis=1, keepdims=True), TINY)
-        left, sizes, _ = np.linalg.svd(small, full_matrices=False)
-        strengths = np.abs(left[:, 0]) * sizes[0]
-        return cls(every @ (axes[:, kept] / np.sqrt(shares[kept])), strengths)
+        common = every @ (axes[:, kept] / np.sqrt(shares[kept]))
+        seen = model @ common
+        seen = seen / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), TINY)
+        left, sizes, _ = np.linalg.svd(seen, full_matrices=False)
+        factors = (left * sizes)[:, :MOST_FACTORS]
+        return cls(common, factors[:, sizes[:MOST_FACTORS] ** 2 > LEAST_FACTOR])
 
     def root(self, number: int, directions: Float[np.ndarray, "others n"]) -> Columns:
         """R_k of a channel with these D_k."""
-        return self.strengths[number] * directions.T @ self.directions
+        return np.kron(self.strengths[number], directions.T @ self.directions)
+
+    @property
+    def size(self) -> int:
+        """Number of common unknowns."""
+        return self.directions.shape[1] * self.strengths.shape[1]
 
     def misfit(self, channels: Iterable[tuple[Columns, Vector, Square]]) -> float:
         """What one x adds to the sum of chi^2 of channels with an x each: zero on average.
@@ -454,7 +463,7 @@ class AlikeAbove:
         channels : iterable of ((others, n), (n,), (n, n)) arrays
             D_k, and mean and covariance of the amplitudes from the channel's own data.
         """
-        one = np.eye(self.directions.shape[1])
+        one = np.eye(self.size)
         precision, vector, square = one, np.zeros(len(one)), 0.0
         for number, (directions, mean, covariance) in enumerate(channels):
             root = self.root(number, directions)
@@ -501,14 +510,13 @@ class Tied:
     @classmethod
     def of_nothing(cls, n_channels: int) -> Tied:
         """Of channels without common amplitudes."""
-        none = np.zeros((n_channels, 0, 0))
-        mean = np.zeros((n_channels, 0))
-        return cls(mean, none, np.zeros(0), none, mean[None], 0.0)
+        mean, root = np.zeros((n_channels, 0)), np.zeros((n_channels, 0, 0))
+        return cls(mean, root, mean[0], root, mean[None], 0.0)
 
     @property
     def start(self) -> Vector:
         """Values of all common unknowns before channels have common skies."""
-        n = 0 if self.above is None else self.above.directions.shape[1]
+        n = 0 if self.above is None else self.above.size
         return np.concatenate([self.white, np.zeros(n)])
 
     @property

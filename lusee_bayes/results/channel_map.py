@@ -333,7 +333,7 @@ class Conditioned:
         fitting = experiment.fitting
         altitude = experiment.highest_altitude
         if not joint:
-            found["departure"] = Departure.of(altitude, self.posterior, *self._shared(alone))
+            found["departure"] = Departure.of(altitude, self.posterior, self._shared(alone))
         stronger += (APART,) * (joint and self.onto and experiment.setup.above is not None)
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
@@ -376,7 +376,7 @@ class Conditioned:
         return None
 
     def _shared(self, alone: bool) -> tuple[WithSky, Columns, Above]:
-        """Covariance, w and above of :class:`.Departure`, in K^2 and K."""
+        """Parts of a :class:`.Departure`, in K^2 and K."""
         above = None if alone else self.above
         unknowns, sources, n = self.unknowns, self.covariance[:0], 0
         shared, none = np.zeros(0, dtype=int), np.zeros((len(self.covariance), 0))
@@ -391,7 +391,8 @@ class Conditioned:
         lower = np.linalg.cholesky(given.covariance[np.ix_(shared, shared)])
         both = np.concatenate([with_all, given.covariance[n:]])[:, shared]
         w, inner = np.split(solve_lower(lower, both.T, transpose=False).T, [len(with_all)])
-        beyond = none if above is None else (with_all[:, n:] - w @ inner.T) @ above.directions.T
+        beyond = with_all[:, n:] - w @ inner.T  # without columns if the model ends at lmax
+        beyond = beyond if above is None else beyond @ above.directions.T
         return np.concatenate([self.covariance, sources]), w, beyond
 
     def _judged(self, misfit: Residuals, *, truncated: bool) -> Judged:

@@ -33,6 +33,8 @@ from lusee_bayes.results.summaries import JointSummary, MapSummary, PullSummary
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
+# what one sky above lmax for all channels may add to chi^2, in roots of its degrees of freedom
+FAR_OFF = 15.0
 # smallest part of the sky in which channels have observed other parts of it
 OTHER = 0.01
 
@@ -189,9 +191,10 @@ class MapResult(Described):
     def fits(self) -> ChannelFits:
         """chi^2 of every channel, and the joint tests."""
         parts, joint = tuple(c.instrument for c in self.channels), self.joint is not None
-        above = self.joint.misfit_above if joint else 0.0
-        chi2 = self.joint.chi2 if joint else float(self.stacked("chi2_model").sum())
-        chi2 -= sum(part.chi2 for part in parts) + above
+        chi2, seen_above = self.stacked("chi2_model").sum(), self.stacked("seen_above")
+        if joint:  # the prior of the map is not that of the sky above lmax, unless that is far off
+            chi2 = self.joint.chi2 - min(self.joint.misfit_above, FAR_OFF * seen_above.sum() ** 0.5)
+        chi2 = float(chi2) - sum(part.chi2 for part in parts)
         degrees = float(self.stacked("n_data").sum()) - sum(part.degrees for part in parts)
         # one sky in all channels: their parts may be as good as the same, and a mean is no surer
         n = 1 if joint else len(parts)
@@ -199,8 +202,7 @@ class MapResult(Described):
         if not joint and (known := [c.prior_of_all for c in self.channels])[0] is not None:
             prior = ChiSquare(sum(k.chi2 for k in known) / n, sum(k.degrees for k in known) / n)
         learned = any(c.log_evidence_learned is not None for c in self.channels)
-        seen_above = tuple(c.seen_above for c in self.channels)
-        more = joint, self.shared_tests, learned, seen_above, above
+        more = joint, self.shared_tests, learned, tuple(seen_above.tolist())
         return ChannelFits(self.frequencies_mhz, parts, prior, *more)
 
     @cached_property

@@ -105,12 +105,7 @@ class Departure:
 
     @classmethod
     def of(
-        cls,
-        highest_altitude: Pixels,
-        posterior: Posterior,
-        covariance: WithSky,
-        w: Columns,
-        above: Above,
+        cls, highest_altitude: Pixels, posterior: Posterior, parts: tuple[WithSky, Columns, Above]
     ) -> Departure:
         """Compute it from a posterior given a channel's own data.
 
@@ -119,14 +114,13 @@ class Departure:
         highest_altitude : (pixels,) array
         posterior : Posterior
             With the channel's prior.
-        covariance : (modes + sources, modes) array
-            Of the sky and of :class:`.Fluxes` with the sky, in K^2.
-        w : (modes + sources, shared) array
-            Root of the part of it that would vanish if what channels share were known, in K.
-        above : (modes + sources, others) array
-            F: covariance with the sky above lmax, in prior standard deviations, if that is known.
+        parts : tuple of arrays
+            (modes + sources, modes): the covariance of the sky and of :class:`.Fluxes` with the
+            sky, in K^2. (modes + sources, shared): w, a root of the part of it that would vanish if
+            what channels share were known, in K. (modes + sources, others): F, the covariance with
+            the sky above lmax, in prior standard deviations, if what channels share is known.
         """
-        prior, mean = posterior.prior, np.asarray(posterior.mean)
+        prior, mean, (covariance, w, above) = posterior.prior, np.asarray(posterior.mean), parts
         n, inside = len(mean), np.stack([*sky_regions(highest_altitude).values()])
         rows = block_diag(averaging_rows(inside, lmax_of(n)), np.eye(len(w) - n))
         error = np.asarray(prior.whiten(rows @ covariance - (rows @ w) @ w[:n].T))

@@ -667,7 +667,7 @@ def map_channels(
             seen = [changed.get(f, one) for f, one in zip(frequencies, seen, strict=True)]
         tied, tests = tie_channels(scenario, frequencies, [one.share for one in seen])
     if scenario.joint:
-        tied, misfit = _with_sky_above(tied, mapped, files, [one.sky for one in seen])
+        tied, misfit = _with_sky_above(tied, mapped, files)
         at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
         components, posterior = solve_components(
             _without(unmapped, scenario),
@@ -694,7 +694,7 @@ def map_channels(
 
 
 def _with_sky_above(
-    tied: Tied | None, channels: Sequence[Scenario], files: ChannelFiles, skies: list[SkyModes]
+    tied: Tied | None, channels: Sequence[Scenario], files: ChannelFiles
 ) -> tuple[Tied | None, float]:
     """Add the sky above lmax, if any, to what channels have in common, and its part of chi^2."""
 
@@ -705,7 +705,8 @@ def _with_sky_above(
     some = [above(k) for k in sorted({0, n // 2, n - 1})]
     if some[0] is None:
         return tied, 0.0
-    alike = AlikeAbove.of([one.directions for one in some], np.stack(skies))
+    model = np.stack([above(k).model for k in range(n)])
+    alike = AlikeAbove.of([one.directions for one in some], model)
     each = ((one.directions, one.mean, one.covariance) for one in map(above, range(n)))
     return replace(tied or Tied.of_nothing(n), above=alike), alike.misfit(each)
 
