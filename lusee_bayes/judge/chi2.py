@@ -102,9 +102,9 @@ class ChiSquare:
         """p, and chi^2 with its expectation."""
         return f"p {probability(self.p)}, {self.chi2_words()}"
 
-    def chi2_words(self) -> str:
-        """chi^2 with its expectation."""
-        expected = f"{self.degrees:.0f} +- {np.sqrt(2.0 * self.degrees):.0f}"
+    def chi2_words(self, share: float = 1.0) -> str:
+        """chi^2 with its expectation, if only this share of its degrees is independent."""
+        expected = f"{self.degrees:.0f} +- {np.sqrt(2.0 * self.degrees / share):.0f}"
         return f"chi2 {self.chi2:.0f}, expected {expected}"
 
 

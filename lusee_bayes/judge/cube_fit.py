@@ -134,7 +134,7 @@ class ChannelFits:
         of_prior = self.prior.p_of_prior(self.learned)
         where = f"{self.frequencies_mhz[least]:g} MHz, {self.channels[least].chi2_words()}"
         return [
-            JointTest("sum over all channels", whole, 1, self.total.chi2_words()),
+            JointTest("sum over all channels", whole, 1, self.total.chi2_words(share)),
             JointTest("channels above the median", signs, 1, f"{above} of {n}"),
             JointTest("most deviant channel", float(p[least]), n, where),
             JointTest(name, of_prior, 1, self.prior.chi2_words(), of_prior=True),
