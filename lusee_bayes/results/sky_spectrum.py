@@ -144,7 +144,7 @@ class RegionTemperatures:
         of a joint posterior.
     shares : (sources, regions) array
         Fraction of each variance that would vanish if an unknown were known: a systematic, or the
-        mean of the sky that never rises; and the fraction from E u. The fractions need not add up.
+        mean of the sky that never rises; and the fractions from E u and F x. They need not add up.
     draws : (draws, regions) array
         Of a joint posterior; empty otherwise.
     cells : (draws, pixels) array or None
