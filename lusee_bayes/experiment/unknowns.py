@@ -497,8 +497,7 @@ def in_common(unknowns: Unknowns | None, above: SkyAbove | None, tied: Tied, num
         root = block_diag(root, np.eye(alike.shape[1]))
     across = given.covariance @ turn
     spread = turn.T @ across + np.eye(turn.shape[1]) - turn.T @ turn
-    pull, reference = turn.T @ given.pull, given.reference
-    return Shared(across, turn.T @ mean, pull, spread, root, reference)
+    return Shared(across, turn.T @ mean, turn.T @ given.pull, spread, root, given.reference)
 
 
 def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:

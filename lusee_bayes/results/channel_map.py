@@ -227,8 +227,8 @@ class Conditioned:
         """Replace n_data and chi^2 by those of all data, which a joint posterior uses."""
         if not self.onto:
             return data
-        instrument = self.split_of_all.instrument
-        return replace(data, n_data=int(self.information.n_data), instrument=instrument)
+        n_data, split = int(self.information.n_data), self.split_of_all
+        return replace(data, n_data=n_data, instrument=split.instrument)
 
     def compared(self) -> Float[np.ndarray, "more modes"] | None:
         """Draws minus the mean for :class:`.Counts`, in K; None if the truth is unknown."""
@@ -239,11 +239,10 @@ class Conditioned:
     def figures(self) -> dict[str, float | bool]:
         """Further arguments of :func:`channel_result`: numbers, and whether C is kept."""
         posterior, judge = self.posterior, self.judged.solution
-        chi2 = float(judge.model.chi2(judge.posterior.mean, judge.data)) - judge.excess
         return {
             "log_evidence": float(posterior.log_evidence),
             "information_bits": float(posterior.information_bits()),
-            "chi2": chi2,
+            "chi2": float(judge.model.chi2(judge.posterior.mean, judge.data)) - judge.excess,
             "chi2_expected": self.expected,
             "chi2_model": judge.chi2,
             "refinement": float(posterior.refinement),

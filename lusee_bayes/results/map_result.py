@@ -33,10 +33,9 @@ from lusee_bayes.results.summaries import JointSummary, MapSummary, PullSummary
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
-# what one sky above lmax for all channels may add to chi^2, in roots of its degrees of freedom
-FAR_OFF = 15.0
-# smallest part of the sky in which channels have observed other parts of it
-OTHER = 0.01
+# smallest part of the sky in which channels have observed other parts of it; what one sky above
+# lmax for all channels may add to chi^2, in roots of its degrees of freedom
+OTHER, ADDED = 0.01, 15.0
 
 
 def prior_sentence(experiment: Experiment) -> str:
@@ -193,7 +192,7 @@ class MapResult(Described):
         parts, joint = tuple(c.instrument for c in self.channels), self.joint is not None
         chi2, seen_above = self.stacked("chi2_model").sum(), self.stacked("seen_above")
         if joint:  # the prior of the map is not that of the sky above lmax, unless that is far off
-            chi2 = self.joint.chi2 - min(self.joint.misfit_above, FAR_OFF * seen_above.sum() ** 0.5)
+            chi2 = self.joint.chi2 - min(self.joint.misfit_above, ADDED * seen_above.sum() ** 0.5)
         chi2 = float(chi2) - sum(part.chi2 for part in parts)
         degrees = float(self.stacked("n_data").sum()) - sum(part.degrees for part in parts)
         # one sky in all channels: their parts may be as good as the same, and a mean is no surer

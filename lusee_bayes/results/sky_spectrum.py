@@ -292,7 +292,9 @@ class SkySpectrum:
         else:
             covariance = np.einsum("frw,grw->rfg", common, common)
             if not n_draws:
-                errors = np.stack([np.hstack([one.error, one.above]) for one in departures])
+                errors = [np.hstack([one.error, one.above]) for one in departures]
+                most = max(e.shape[1] for e in errors)  # a channel's model may end at lmax
+                errors = np.stack([np.pad(e, [(0, 0), (0, most - e.shape[1])]) for e in errors])
                 alike = correlation_of_departures(np.stack([one.mean for one in departures]))
                 covariance += alike * np.einsum("frw,grw->rfg", errors, errors)
             covariance[:, *np.diag_indices(n)] = std.T**2

@@ -513,9 +513,12 @@ def tie_channels(
     tests = shared_tests(mean, covariance, kernels, names, frequencies_mhz)
     alike = None
     if all(one.departure is not None for one in shared):
-        slopes = np.zeros((*mean.shape, shared[0].slopes.shape[1]))
+        # a channel's model may end at lmax
+        slopes = np.zeros((*mean.shape, max(one.slopes.shape[1] for one in shared)))
         for number, one in enumerate(shared):
-            slopes[number, [names.index(name) for name in one.octaves]] = one.slopes
+            slopes[number, [names.index(x) for x in one.octaves], : one.slopes.shape[1]] = (
+                one.slopes
+            )
         departures = np.stack([one.departure for one in shared])
         alike = AlikeErrors(slopes, sky_spectrum.correlation_of_departures(departures))
     for number, test in enumerate(tests):
@@ -702,11 +705,10 @@ def _with_sky_above(
         return files.read(channels[number], ChannelInformation).above
 
     n = len(channels)
-    some = [above(k) for k in sorted({0, n // 2, n - 1})]
-    if some[0] is None:
+    if any(above(k) is None for k in range(n)):
         return tied, 0.0
-    model = np.stack([above(k).model for k in range(n)])
-    alike = AlikeAbove.of([one.directions for one in some], model)
+    some = [above(k).directions for k in sorted({0, n // 2, n - 1})]
+    alike = AlikeAbove.of(some, np.stack([above(k).model for k in range(n)]))
     each = ((one.directions, one.mean, one.covariance) for one in map(above, range(n)))
     return replace(tied or Tied.of_nothing(n), above=alike), alike.misfit(each)
 
