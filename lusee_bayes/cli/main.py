@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from os.path import expanduser
 from threading import current_thread, main_thread
 
-from cyclopts import CycloptsError, UnknownOptionError
+from cyclopts import CycloptsError, UnknownOptionError, UnusedCliTokensError
 
 from lusee_bayes.cli.commands import app
 from lusee_bayes.cli.options import say
@@ -29,7 +29,10 @@ HOME = re.compile(r"^(--[a-z-]+=)?(~.*)$", re.DOTALL)
 
 # how out-of-memory RuntimeErrors begin: those of XLA, and of Python's threads
 NO_MEMORY = ("RESOURCE_EXHAUSTED", "can't start new thread")
-KEYS = " Keys of a scenario are set with --set KEY=VALUE."
+HINTS = {
+    UnknownOptionError: " Keys of a scenario are set with --set KEY=VALUE.",
+    UnusedCliTokensError: " Values that contain spaces need quotes: --set 'KEY={a: 1}'.",
+}
 UNCHANGED = "results are complete or unchanged"
 
 
@@ -94,8 +97,7 @@ def _outcome(arguments: list[str], came: list[int]) -> tuple[int, str]:
     try:
         code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except (InputError, CycloptsError) as error:
-        hint = KEYS if isinstance(error, UnknownOptionError) else ""
-        return 2, " ".join(str(error).split()) + hint
+        return 2, " ".join(str(error).split()) + HINTS.get(type(error), "")
     except BrokenPipeError:
         # the reader closed the pipe, as head does when it has its lines
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

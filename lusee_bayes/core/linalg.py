@@ -301,16 +301,40 @@ def spanning_rows(
     return np.array(picked), np.linalg.solve(coordinates[picked].T, coordinates.T).T
 
 
+def pivoted_cholesky(
+    matrix: Square, least: float
+) -> tuple[Float[np.ndarray, "n rank"], Int[np.ndarray, " n"]]:
+    """Factorise a positive semidefinite matrix, the largest remaining diagonal entry first.
+
+    Parameters
+    ----------
+    matrix : (n, n) array
+        Only the lower triangle is read.
+    least : float
+        Where to stop: the remaining diagonal entries are not larger.
+
+    Returns
+    -------
+    (n, rank) array
+        F, with F F^T the matrix but for the remainder.
+    (n,) array of int
+        The rows' order: F[order] is lower triangular.
+    """
+    n, lower = len(matrix), np.array(matrix, order="C")
+    pivots, rank = (ctypes.c_int * n)(), (ctypes.c_int * 1)()
+    _called("dpstrf", b"U", n, lower, n, pivots, rank, least, np.empty(2 * n))
+    order = np.array(pivots) - 1
+    return np.tril(lower[:, : rank[0]])[np.argsort(order)], order
+
+
 def main_directions(matrix: Matrix, left_out: float) -> Float[np.ndarray, "n few"]:
     """Return the fewest orthonormal directions X for which tr(M - M X X^T) < ``left_out``.
 
     They are eigenvectors of a positive semidefinite M, found among the few columns of its pivoted
     Cholesky factor: all others together have at most ``SCREENED`` of ``left_out``.
     """
-    n, lower = len(matrix), np.array(matrix, order="C")
-    pivots, rank = (ctypes.c_int * n)(), (ctypes.c_int * 1)()
-    _called("dpstrf", b"U", n, lower, n, pivots, rank, SCREENED * left_out / n, np.empty(2 * n))
-    basis, triangle = np.linalg.qr(np.tril(lower[:, : rank[0]])[np.argsort(pivots)])
+    columns, _ = pivoted_cholesky(matrix, SCREENED * left_out / len(matrix))
+    basis, triangle = np.linalg.qr(columns)
     squares, directions = np.linalg.eigh(triangle @ triangle.T)
     without = np.trace(matrix) - squares.sum() + np.cumsum(squares)
     return basis @ directions[:, np.searchsorted(without, left_out) :]

@@ -49,11 +49,11 @@ from scipy.special import logsumexp
 from lusee_bayes.core.arrays import Draws, ModesMatrix, Square
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError, refusing
-from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky
+from lusee_bayes.core.linalg import checked_cholesky, inverse_from_cholesky, solve_lower
 from lusee_bayes.judge import measures, split
 from lusee_bayes.judge.chi2 import ChiSquare
+from lusee_bayes.linear.compressed import Compressed
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily
 from lusee_bayes.sky.prior import Prior
 
@@ -129,9 +129,6 @@ LONGEST = 3.0
 FRACTIONS = 0.5 ** np.arange(11)
 # simulated data sets for the Fisher information: on the way to the maximum, and at it
 SIMULATIONS, FINAL_SIMULATIONS = 200, 500
-# added to a covariance with eigenvalues from 0 to 1 before its root is computed: rounding makes the
-# negligible ones near 0 wrong by eps times the condition number of Lambda, up to 1e-5
-ROUNDING = 1e-4
 # multiples of the factor of N that misfitting data demand, tried one after the other
 HIGHER = np.array([1.0, 1e2, 1e4])
 INFINITE = "the mean of a variance over the prior's uncertain parameters is infinite"
@@ -202,29 +199,30 @@ class Learned:
 
 @dataclass(frozen=True)
 class _Point:
-    """Prior, posterior and ln p(d, theta) at some theta."""
+    """Prior, data and ln p(d, theta) at some theta."""
 
     parameters: Parameters
     member: Member
-    posterior: Posterior
+    compressed: Compressed
+    prior: Prior
+    lower: Square
     value: float
 
     @cached_property
-    def resolution(self) -> Square:
-        """The part of the prior's covariance of u that the data remove: 1 - Lambda^-1."""
-        return np.eye(self.posterior.prior.size) - inverse_from_cholesky(self.posterior.lower)
+    def response(self) -> Float[np.ndarray, "combinations modes"]:
+        """W = L^-1 V^T, with F = W^T W and g = W^T L^-1 q."""
+        return solve_lower(self.lower, self.compressed.response, transpose=False)
 
     def slope(self, family: PriorFamily) -> Parameters:
         """Gradient of ln p(d, theta)."""
-        prior, mean = self.posterior.prior, self.posterior.white_mean
-        expected = prior.whitened_sandwich(self.resolution)
-        of_data = self.member.forms(prior.whiten_columns((mean - prior.white_mean)[None]).T)[:, 0]
-        return of_data - self.member.traces(expected) + family.hyperprior.gradient(self.parameters)
+        white = solve_lower(self.lower, self.compressed.data[:, None], transpose=False)
+        of_data = self.member.forms(self.response.T @ white)[:, 0]
+        expected = self.member.traces(self.response.T @ self.response)
+        return of_data - expected + family.hyperprior.gradient(self.parameters)
 
     def curvature(self, family: PriorFamily, rng: Generator, n: int) -> Square:
         """Expected curvature of -ln p(d, theta), from simulated data sets."""
-        drawn = _root(self.resolution) @ rng.standard_normal((len(self.resolution), n))
-        scores = self.member.forms(self.posterior.prior.whiten_columns(drawn.T).T)
+        scores = self.member.forms(self.response.T @ rng.standard_normal((len(self.response), n)))
         scores = scores - scores.mean(1, keepdims=True)
         curvature = scores @ scores.T / (n - 1.0)
         curvature[np.diag_indices(len(curvature))] += family.hyperprior.curvature(self.parameters)
@@ -253,15 +251,18 @@ def learn(
         its gradient, or the mean of a variance is infinite.
     """
     rng, path = np.random.default_rng(seed), []
-    point = _at(family, information, family.hyperprior.start() if start is None else start)
+    start = family.hyperprior.start() if start is None else start
+    variance = np.diagonal(family.at(start).covariance)
+    compressed = Compressed.of(information, family.mean, variance)
+    point = _at(family, compressed, start)
     for _ in range(MAX_STEPS + 1):
         gradient = point.slope(family)
         path.append((point.parameters, gradient))
         curvature = _corrected(point.curvature(family, rng, SIMULATIONS), path)
         step = np.linalg.solve(curvature, gradient)
         if (gain := 0.5 * float(gradient @ step)) < SETTLED:
-            return _learned(family, information, point, rng)
-        point = _climb(family, information, point, step * min(1.0, LONGEST / np.abs(step).max()))
+            return _learned(family, compressed, point, rng)
+        point = _climb(family, compressed, point, step * min(1.0, LONGEST / np.abs(step).max()))
     raise InputError(
         f"the prior's parameters did not converge in {MAX_STEPS} steps: the next would still add "
         f"{gain:.2g} to ln p (accepted: {SETTLED:g})"
@@ -343,43 +344,29 @@ def _fixed(family: PriorFamily, information: Information, factor: float) -> Lear
     raise failed
 
 
-def _at(family: PriorFamily, information: Information, parameters: Parameters) -> _Point:
+def _at(family: PriorFamily, compressed: Compressed, parameters: Parameters) -> _Point:
     member = family.at(parameters)
-    posterior = information.posterior(family.prior(member.covariance))
-    value = float(posterior.log_evidence) + family.hyperprior.log_density(parameters)
-    return _Point(parameters, member, posterior, value)
+    prior = family.prior(member.covariance)
+    lower = compressed.root(compressed.covariance(prior))
+    value = compressed.log_evidence(lower) + family.hyperprior.log_density(parameters)
+    return _Point(parameters, member, compressed, prior, lower, value)
 
 
-def _climb(family: PriorFamily, information: Information, base: _Point, step: Parameters) -> _Point:
+def _climb(family: PriorFamily, compressed: Compressed, base: _Point, step: Parameters) -> _Point:
     """The end of a step, or of a half, a quarter, ... of it, if ln p is not lower there."""
     for part in FRACTIONS:
         with suppress(InputError):  # too far: S has no Cholesky factor there
-            trial = _at(family, information, base.parameters + part * step)
+            trial = _at(family, compressed, base.parameters + part * step)
             if trial.value >= base.value - SETTLED / 10.0:
                 return trial
     wrong = "the prior's parameters do not converge: ln p decreases along its gradient, by rounding"
     raise InputError(wrong)
 
 
-def _root(covariance: Square) -> Float[np.ndarray, "n k"]:
-    """A root of a covariance with eigenvalues from 0 to 1.
-
-    If the data are very precise, those near 0 are wrong by more than ``ROUNDING``; eigenvalues are
-    then clipped to 0 and 1.
-    """
-    root = cholesky(covariance + ROUNDING * np.eye(len(covariance)))
-    if np.isfinite(np.diagonal(root)).all():
-        return root
-    values, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.clip(values, 0.0, 1.0))
-
-
-def _learned(
-    family: PriorFamily, information: Information, point: _Point, rng: Generator
-) -> Learned:
+def _learned(family: PriorFamily, compressed: Compressed, point: _Point, rng: Generator) -> Learned:
     covariance = np.linalg.inv(point.curvature(family, rng, FINAL_SIMULATIONS))
     scores = normal_scores(family.hyperprior, point.parameters, covariance)
-    evidence = float(point.posterior.log_evidence) + scores.log_gain
+    evidence = compressed.log_evidence(point.lower) + scores.log_gain
     first = np.arange(len(covariance)) == 0
     mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
     limited = np.linalg.inv(about)[0, 0] < MEASURED**-2
@@ -389,13 +376,16 @@ def _learned(
         mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
 
     # S is a constant plus a part proportional to the level
-    def at_level(shift: float) -> Posterior:
-        return information.posterior(family.prior(once + np.expm1(shift) * (twice - once)))
+    def at_level(shift: float, once: Square, twice: Square) -> Square:
+        return once + np.expm1(shift) * (twice - once)
 
     try:
         with np.errstate(over="raise"), refusing(INFINITE, FloatingPointError):
-            once, twice = (family.averaged(mean + by * first, about) for by in (0.0, np.log(2.0)))
-        tried = [float(at_level(shift).log_evidence) for shift in (LIMITED if limited else LEVELS)]
+            both = [family.averaged(mean + by * first, about) for by in (0.0, np.log(2.0))]
+        of_data = [compressed.covariance(family.prior(one)) for one in both]
+        shifts = LIMITED if limited else LEVELS
+        roots = (compressed.root(at_level(by, *of_data)) for by in shifts)
+        tried = [compressed.log_evidence(root) for root in roots]
         if limited:
             of_prior = [family.hyperprior.log_density(mean + by * first) for by in LIMITED]
             log_p = np.add(tried, of_prior)
@@ -404,13 +394,13 @@ def _learned(
             square, linear, _ = np.polyfit(LEVELS, tried, 2)
             shift = -0.5 * linear / square if square < 0 else LEVELS[int(np.argmax(tried))]
             shift = float(np.clip(shift, LEVELS[0] - 1.0, LEVELS[-1] + 1.0))
-        prior = at_level(shift).prior
+        prior = family.prior(at_level(shift, *both))
     except InputError:  # too uncertain to be averaged: the most probable values
-        prior, shift, still = point.posterior.prior, 0.0, FIXED**2 * np.eye(len(mean))
+        prior, shift, still = point.prior, 0.0, FIXED**2 * np.eye(len(mean))
         scores = Scores(family.hyperprior.scores(point.parameters), still, scores.log_gain)
     moved = shift * first / family.hyperprior.slopes_of_scores(scores.mean)[0]
     scores = replace(scores, mean=scores.mean + moved)
-    averaged = prior is not point.posterior.prior
+    averaged = prior is not point.prior
     return Learned(prior, point.parameters, covariance, scores, evidence, averaged=averaged)
 
 
@@ -460,26 +450,28 @@ def draws_with_parameters(
     if not n:
         return drawn
     root = np.linalg.cholesky(learned.scores.covariance)
+    compressed = Compressed.of(information, family.mean, np.asarray(learned.prior.variance()))
     sets = max(min(-(-n // 2), LEAST), -(-n // SHARED))
 
     def some(k: int) -> None:
         subkey = jax.random.fold_in(key, k)
-        posterior = _under_drawn_parameters(family, learned, root, information, subkey)
-        drawn[k::sets] = posterior.sample(jax.random.fold_in(subkey, ATTEMPTS), len(drawn[k::sets]))
+        prior = _under_drawn_parameters(family, learned, root, subkey)
+        subkey = jax.random.fold_in(subkey, ATTEMPTS)
+        drawn[k::sets] = compressed.sample(prior, subkey, len(drawn[k::sets]))
 
     in_threads(some, range(sets))
     return drawn
 
 
 def _under_drawn_parameters(
-    family: PriorFamily, learned: Learned, root: Square, information: Information, key: PRNGKeyArray
-) -> Posterior:
+    family: PriorFamily, learned: Learned, root: Square, key: PRNGKeyArray
+) -> Prior:
     scores = learned.scores.mean
     for attempt in range(ATTEMPTS):
         z = jax.random.normal(jax.random.fold_in(key, attempt), (len(root),), dtype=jnp.float64)
         parameters = family.hyperprior.near(scores, scores + root @ np.asarray(z))
         try:
-            return information.posterior(family.prior(family.at(parameters).covariance))
+            return family.prior(family.at(parameters).covariance)
         except InputError as error:
             failed = error
     why = f"cannot draw skies with uncertain prior parameters: {failed}; use prior.model=isotropic"

@@ -33,7 +33,7 @@ SQUARES, JOINT_SQUARES, OPERATIONS = 8, 4, 12
 # rounds of positive joint skies, including those that learn the laws of their fields
 ROUNDS = 8
 # arrays and operations for learning a prior: about five steps with all modes
-LEARNING_SQUARES, LEARNING_OPERATIONS = 4, 80
+LEARNING_SQUARES, LEARNING_OPERATIONS = 4, 50
 # rounds that infer an instrument: operations per datum and unknown, and arrays of data for each
 # error of the fields
 IN_ROUNDS, FIELD_ARRAYS = 3e5, 8

@@ -75,10 +75,6 @@ class Prior(Described, eqx.Module):
     def sandwich(self, matrix: Covered) -> Float[Array, "white white"]:
         """Compute G^T M G for a symmetric M: information about m becomes information about u."""
 
-    def whitened_sandwich(self, matrix: Float[Array, "white white"]) -> Covered:
-        """Compute G^-T M G^-1 for a symmetric M."""
-        return self.whiten_columns(self.whiten_columns(matrix).T)
-
     def colour_covariance(self, white: Float[Array, "white white"]) -> Covered:
         """Compute G C G^T for a symmetric C: the covariance of u becomes that of m.
 
@@ -214,9 +210,6 @@ class DensePrior(Prior):
 
     def sandwich(self, matrix):
         return linalg.sandwich(matrix, self.root)
-
-    def whitened_sandwich(self, matrix):
-        return linalg.inverse_sandwich(matrix, self.root, transpose=True)
 
     def colour_covariance(self, white):
         return linalg.outer_sandwich(white, self.root)

@@ -299,6 +299,7 @@ CALLS = [
     ("validate fiducial --set frequencies_mhz=[10,20]", 2, "a validation has one frequency"),
     ("map fiducial --clock=c.json", 2, "--clock is for session files"),
     ("map --lmax 8", 2, "Unknown option: --lmax. Keys of a scenario are set with --set KEY=VALUE"),
+    ("map fiducial --set a={b: 0.01}", 2, "['0.01}']. Values that contain spaces need quotes"),
 ]
 
 
