@@ -119,7 +119,8 @@ def test_lack_of_memory_or_disk_is_tried_again(engine, tmp_path):
 
     with pytest.raises(OSError, match="No space left on device"):
         engine.each(tasks_of(full, 1), Stages(), "maps")
-    assert len(list(tmp_path.glob("10-*"))) == 4
+    # on a busy machine, one may die after it got the task and before it begins
+    assert len(list(tmp_path.glob("10-*"))) in (3, 4)
 
 
 @pytest.mark.essential
@@ -145,7 +146,8 @@ def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
 
     with pytest.raises(WorkersLost, match="^sums, number 1: 4 workers died on"):
         engine.reduced(tasks_of(always, 3), joined, Stages(), "sums")
-    assert len(list(tmp_path.glob("10-*"))) == 4
+    # on a busy machine, one may die after it got the task and before it begins
+    assert len(list(tmp_path.glob("10-*"))) in (3, 4)
     # and what comes next is not affected
     assert engine.each(tasks_of(abs, 4), Stages(), "s") == [0, 1, 2, 3]
 
