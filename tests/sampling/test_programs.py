@@ -15,11 +15,14 @@ from experiments import density
 from numpyro import handlers
 from reference_linear import assert_draws_follow, posterior
 from small_models import random_gaussian
+from tables import tables
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.sampling import programs
+
+TABLES = tables(__file__)
 
 SPECTRUM = np.array([4.0, 1.0, 0.5])
 ELL_OF_MODE = np.repeat([0, 1, 2], [1, 3, 5])
@@ -113,24 +116,7 @@ def test_no_such_program(tmp_path):
         refuse(rf"no program.*{re.escape(str(source))}.*sky_marginal", lb.load_program, source)
 
 
-NO_PROGRAMS = [
-    ("def model(:\n", "fails when it is loaded", "line 1"),
-    ("import nowhere_to_be_found\n", "fails when it is loaded", "nowhere_to_be_found"),
-    ("open('/nonexistent/table.txt')\n", "fails when it is loaded", "/nonexistent/table.txt"),
-    ("assert 1 > 2, 'not so'\n", "fails when it is loaded", "not so"),
-    *(
-        (text, "has no function 'model'", "def model(")
-        for text in ("x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n")
-    ),
-    ("def model(coupling, prior):\n    pass\n", "has no argument 'data'", "mine.py"),
-    # prior predictive draws need it; better refused now than after the sampling
-    ("def model(coupling, data):\n    pass\n", "data=None", "mine.py"),
-    ("def model(coupling, nois, data=None):\n    pass\n", "asks for 'nois'", "mean 'noise'?"),
-    ("def model(xyz, data=None):\n    pass\n", "asks for 'xyz'", "noise"),
-]
-
-
-@pytest.mark.parametrize(("text", "message", "more"), NO_PROGRAMS)
+@pytest.mark.parametrize(("text", "message", "more"), TABLES["no programs"])
 def test_files_that_are_no_programs(write, text, message, more):
     path = write(text)
     with refused(message) as error:
@@ -263,48 +249,12 @@ def model(coupling, prior, noise, data=None):
     sky = numpyro.sample("sky", SkyPrior(prior))
     loc = coupling @ sky
 """
-TWICE = '    numpyro.deterministic("twice", 2 * sky)\n'
-GOOD = '    numpyro.sample("data", CorrelatedNormal(loc, noise), obs=data)\n'
+GOOD = 'numpyro.sample("data", CorrelatedNormal(loc, noise), obs=data)'
 
-BAD = {
-    "raises": ("    raise OSError('no disc')\n" + GOOD, r"fails when it is called \(line 10\): OS"),
-    "exits": ("    raise SystemExit(3)\n" + GOOD, "fails when it is called"),
-    "twice": ('    numpyro.sample("sky", dist.Normal(0, 1))\n' + GOOD, "sky"),
-    "discrete": ('    numpyro.sample("k", dist.Poisson(3))\n' + GOOD, "discrete site 'k'"),
-    "slash": ('    numpyro.sample("a/b", dist.Normal(0, 1))\n' + GOOD, "a site 'a/b'"),
-    "empty": ('    numpyro.sample("", dist.Normal(0, 1))\n' + GOOD, "a site ''"),
-    "statistic": ('    numpyro.deterministic("energy", loc)\n' + GOOD, "'energy', a reserved"),
-    "complex one": ('    numpyro.deterministic("z", 1j * loc)\n' + GOOD, "complex site 'z'"),
-    "dimension": ('    numpyro.sample("chain", dist.Normal(0, 1))\n' + GOOD, "'chain', a reserved"),
-    "derived": ('    numpyro.deterministic("x/y", loc)\n' + GOOD, "a site 'x/y'"),
-    "shape": (
-        "    data = None if data is None else data[:-1]\n"
-        '    numpyro.sample("data", dist.Normal(loc[:-1], 1), obs=data)\n',
-        "observes 'data' with shape",
-    ),
-    "column": (
-        '    numpyro.sample("data", dist.Normal(loc[:, None], 1), obs=data)\n',
-        "observes 'data' with shape|fails when",
-    ),
-    "complex": (
-        '    numpyro.factor("c", 1j * sky[0])\n' + GOOD,
-        "fails when its density is differentiated",
-    ),
-    "traced": ("    float(sky[0])\n" + GOOD, "fails when it is called"),
-    "improper": (
-        '    numpyro.sample("u", dist.ImproperUniform(dist.constraints.real, (), ()))\n' + GOOD,
-        "fails when",
-    ),
-    "only with data": (
-        '    if data is not None:\n        numpyro.sample("x", dist.Normal(0, 1))\n' + GOOD,
-        "samples 'x' only with data",
-    ),
-    "no data": (
-        '    if data is not None:\n        numpyro.sample("data", dist.Normal(loc, 1), obs=data)\n',
-        "draws no data if data=None",
-    ),
-    "unobserved": ('    numpyro.sample("data", dist.Normal(loc, 1))\n', "no observed site 'data'"),
-}  # fmt: skip
+
+def text_of(*lines):
+    """Lines that follow the head, one of which observes the data where it says GOOD."""
+    return HEAD + "".join(f"    {GOOD if line == 'GOOD' else line}\n" for line in lines)
 
 
 @pytest.fixture(scope="module")
@@ -322,7 +272,8 @@ def check(path, pieces):
 
 
 def test_a_good_program_passes(write, pieces):
-    path = write(HEAD + '    numpyro.sample("x.y-1", dist.Normal(0, 1))\n' + TWICE + GOOD)
+    twice = 'numpyro.deterministic("twice", 2 * sky)'
+    path = write(text_of('numpyro.sample("x.y-1", dist.Normal(0, 1))', twice, "GOOD"))
     assert check(path, pieces) == ["sky", "x.y-1"]
 
 
@@ -331,8 +282,8 @@ def test_the_packages_programs_pass(name, pieces):
     assert check(name, pieces)
 
 
-TEXTS = {name: (HEAD + body, message) for name, (body, message) in BAD.items()}
-TEXTS["no sky"] = (HEAD + GOOD).replace('"sky"', '"mine"'), "has no site 'sky'"
+TEXTS = {name: (text_of(*body), said) for name, (*body, said) in TABLES["bad programs"].items()}
+TEXTS["no sky"] = text_of("GOOD").replace('"sky"', '"mine"'), "has no site 'sky'"
 KNOWN = re.sub(r'numpyro.sample\("(slope|gains)".*', "jnp.ones(1)", OFFSET_PROGRAM)
 TEXTS["no unknowns"] = KNOWN, "no latent site"
 
