@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from assertions import refuse
 from experiments import flagged, mapped
+from tables import tables
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import map_to_modes
@@ -136,21 +137,7 @@ def test_files_of_another_frequency_are_scaled(files):
     np.testing.assert_allclose(prior.mean, 2**2.5 * map_to_modes(pixels, FILE_LMAX), rtol=1e-14)
 
 
-BAD_SPECTRA = [
-    ("0 1\n1 2\n3 4\n", "no C_ell at ell = 2"),
-    ("2 1\n3 2\n", "no C_ell at ell = 0"),
-    ("0 1\n1 2\n", "no C_ell at ell = 2 and 4 more up to lmax = 6"),
-    ("0 1\n0 2\n", "does not increase"),
-    ("".join(f"{ell} 0\n" for ell in range(9)), "cl.txt: C_ell is zero"),
-    ("0 -1\n", "outside 0 to inf"),
-    ("0 nan\n", "NaN"),
-    ("0 1 2\n", "expected ell and C_ell"),
-    ("", "no numbers"),
-    ("\0\1", "cl.txt"),
-]
-
-
-@pytest.mark.parametrize(("text", "words"), BAD_SPECTRA)
+@pytest.mark.parametrize(("text", "words"), tables(__file__)["bad spectra"])
 def test_a_bad_spectrum_is_refused(write, text, words):
     refuse(words, read_spectrum, write(text, "cl.txt"), FILE_LMAX)
 

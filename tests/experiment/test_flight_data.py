@@ -332,25 +332,15 @@ def test_the_known_sky_is_within_the_error_bars(mapped):
         assert row["std"] < 0.1 * row["prior_std"]
 
 
-NO_VOLTS = "beam={model: monopole}", "noise.receiver=null"
-VOLTS = "flight.per_kelvin_v2_hz=5.0e-23"
-ASKED = [
-    (["flight.gain_table=null"], "has no gain table"),
-    (["flight.bin_origin=null"], "flight.bin_origin=centre"),
-    (["observation.timestamp=null"], "observation.timestamp=middle"),
-    (["flight=null"], "no section flight"),
-    (NO_VOLTS, "not calibrated in volts"),
-    ([VOLTS], "per_kelvin_v2_hz"),
-]
-
-
-@pytest.mark.parametrize(("changes", "told"), ASKED)
+@pytest.mark.parametrize(("changes", "told"), TABLES["asked"])
 def test_what_files_leave_open_is_asked_for_by_name(flight, changes, told):
     refuse(told, lb.read_data, files(flight)[:1], scenario_of(flight, *changes))
 
 
 def test_volts_that_beams_do_not_know_can_be_given(flight):
-    data = lb.read_data(files(flight)[:1], scenario_of(flight, *NO_VOLTS, VOLTS))
+    no_volts = "beam={model: monopole}", "noise.receiver=null"
+    scenario = scenario_of(flight, *no_volts, "flight.per_kelvin_v2_hz=5.0e-23")
+    data = lb.read_data(files(flight)[:1], scenario)
     autos = data.grid()[auto_indices()]
     assert 1e5 < autos.min() < autos.max() < 2e5
 

@@ -311,13 +311,15 @@ def test_layout_4_in_fits_is_refused(tmp_path):
 # --- mission clocks: which UTC they stand for, and what contradicts them --------------------------
 
 
-RECORD = tables(__file__)["record"]
+TABLES = tables(__file__)
 SECONDS = np.array([100.0, 1e5, 3.0e7])
 
 
 def clock_file(tmp_path, **changes):
     path = tmp_path / "clock.json"
-    record = {key: value for key, value in (RECORD | changes).items() if value is not None}
+    record = {
+        key: value for key, value in (TABLES["record"] | changes).items() if value is not None
+    }
     path.write_text(json.dumps(record))
     return path
 
@@ -359,21 +361,10 @@ def test_a_clock_has_to_be_known_and_two_must_not_differ():
     assert clock_of("session", said, same, SECONDS) is same
 
 
-BAD_CLOCKS = [
-    {"format_version": 2}, {"time_scale": "lunar"}, {"clock_reference_isot": "yesterday"},
-    {"clock_reference_isot": "2027-13-10T00:00:00"}, {"clocks": {}},
-    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": "100"}}},
-    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": True}}},
-    {"rate": 2.0}, {"source": 3}, {"drift": 1.0}, {"rate": 10**400},
-    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": 100.0}, "spectrometre": {}}},
-    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": 100.0}, "dcb": 3}},
-    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": 10**400}}},
-    {"stated_utc_isot": "2027-01-10T00:00:00"}, {"stated_utc_isot": "then", "clocks": None},
-]  # fmt: skip
-
-
 def test_a_clock_file_that_cannot_be_is_refused(tmp_path, write):
-    for changes in BAD_CLOCKS:
+    # whole numbers that no float can be
+    huge = {"clocks": {"spectrometer": {"clock_reference_raw_seconds": 10**400}}}
+    for changes in (*TABLES["bad clocks"], huge, {"rate": 10**400}):
         assert_refused(lambda changes=changes: read_clock(clock_file(tmp_path, **changes)))
     clocks = {"spectrometer": {"clock_reference_raw_seconds": 100.0, "rate": 1.000001}}
     refuse("clocks.spectrometer.rate", read_clock, clock_file(tmp_path, clocks=clocks))
