@@ -264,6 +264,11 @@ def read_yaml(path: str | Path, what: str) -> Any:
     return parse_yaml(read_text(path, what), str(path))
 
 
+def table_beside(module: str) -> Any:
+    """The table in the YAML file that has the name of a module's file."""
+    return read_yaml(Path(module).with_suffix(".yaml"), "a table of the package")
+
+
 def as_yaml(tree: Any, *, flow: bool = False) -> str:
     """Write lists, mappings and plain values as YAML, on one line if ``flow``."""
     written, plain = StringIO(), _yaml()

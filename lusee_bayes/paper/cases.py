@@ -15,9 +15,11 @@ from lusee_bayes.experiment import model, sky_sections
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
-from lusee_bayes.paper.claims import TABLE, Cases, cross
+from lusee_bayes.paper.claims import Cases, cross
 from lusee_bayes.results.channel_map import conditioned
 
+# by name: the scenarios, and labels in figures
+TABLE = reading.table_beside(__file__)
 # by name: a scenario of the package, and changes to it
 CASES = {name: (one.get("scenario", name), one.get("changes", [])) for name, one in TABLE.items()}
 

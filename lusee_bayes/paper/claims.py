@@ -5,20 +5,16 @@ by the two conditions given to :func:`grade`. All numbers are computed here from
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from astropy.coordinates import SkyCoord
 from jaxtyping import Bool, Float, Shaped
 
-from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.reading import parse_yaml, read_yaml
+from lusee_bayes.core import lazy, reading
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 
 Cases = Mapping[str, xr.Dataset]
-# the cases by name: their scenarios, and their labels in figures
-TABLE = read_yaml(Path(__file__).with_name("cases.yaml"), "the paper's cases")
 
 FREQUENCIES = tuple(range(5, 51, 5))
 SHOWN_FREQUENCIES = (5, 15, 25, 35, 45)
@@ -27,7 +23,7 @@ SIDEREAL_MONTH_DAYS = 27.3
 
 # each with its section, what the paper says, why it may fail here (``otherwise``), and the function
 # of this module that judges it, without its underscore
-CLAIMS = read_yaml(Path(__file__).with_name("claims.yaml"), "the paper's claims")
+CLAIMS = reading.table_beside(__file__)
 # the result obtained, and whether it agrees with the paper: yes, partly or no
 Verdict = dict[str, str]
 
@@ -97,7 +93,7 @@ def span(values: list[float] | list[int], form: str = "d") -> str:
 
 def entry(case: xr.Dataset, path: str) -> float:
     """An entry of the case's scenario, by its dotted path."""
-    node = parse_yaml(case.attrs["scenario"], "the scenario of a case")
+    node = reading.parse_yaml(case.attrs["scenario"], "the scenario of a case")
     for key in path.split("."):
         node = node[key]
     return float(node)
@@ -236,9 +232,9 @@ def _residuals(cases: Cases) -> Verdict:
 
 def _unobserved_cap(cases: Cases) -> Verdict:
     hidden = ~ever_up(cases["fiducial"])
-    nside = healpy.npix2nside(hidden.size)
+    nside = lazy.healpy.npix2nside(hidden.size)
     radius = float(np.degrees(np.arccos(1 - 2 * hidden.mean())))
-    centre = np.array(healpy.pix2vec(nside, np.flatnonzero(hidden))).sum(axis=1)
+    centre = np.array(lazy.healpy.pix2vec(nside, np.flatnonzero(hidden))).sum(axis=1)
     pole = SkyCoord(0, 90, unit="deg", frame="icrs").galactic.cartesian.xyz.value
     away = float(np.degrees(np.arccos(centre @ pole / max(np.linalg.norm(centre), 1e-30))))
     text = f"a cap of {radius:.1f} degrees, its centre {away:.1f} degrees from that pole"

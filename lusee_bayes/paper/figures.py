@@ -7,25 +7,15 @@ from matplotlib import colormaps, colors
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lusee_bayes.core.harmonics import lmax_of, taper_fwhm_deg
-from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core import harmonics, lazy, reading
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
-from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, TABLE, Cases, frequency_case
+from lusee_bayes.paper.cases import TABLE
+from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, Cases, frequency_case
 from lusee_bayes.report.figures import drawing
 
-# the paper's colours by group, with lightness that colour-blind readers can distinguish; the lines
-# within a group differ in style
-COLOURS = {
-    "radiometer noise": "#E08A00",
-    "beam error": "#009E73",
-    "gain drift": "#B2182B",
-    "cycles and turntable": "#7B4FB5",
-}
+# colours of the groups of scenarios, and the cases whose maps are shown
+SHOWN = reading.table_beside(__file__)
 LINES = ("-", "--", ":")
-MAP_CASES = (
-    "fiducial", "noise_x10", "noise_x100", "beam_4MHz", "beam_0.4MHz", "gain_1e-2", "gain_1e-3",
-    "two_cycles", "three_cycles", "quarter_cycle", "duty_cycle_50",
-)  # fmt: skip
 
 
 def beam_panels(cases: Cases) -> Figure:
@@ -78,13 +68,13 @@ def frequency_maps(cases: Cases) -> Figure:
 
 def _how_drawn(case: xr.Dataset) -> str:
     """Note on the lines and the resolution in a figure of maps."""
-    width = taper_fwhm_deg(lmax_of(case.sizes["mode"]))
+    width = harmonics.taper_fwhm_deg(harmonics.lmax_of(case.sizes["mode"]))
     return f"dashed: never observed; drawn through a beam of {width:.1f}° (FWHM)"
 
 
 def drawn(case: xr.Dataset, name: str) -> Float[np.ndarray, " pixels"]:
     """Map of ``mean`` or ``truth``, smoothed with the taper's beam as in reports."""
-    return drawing.shown(case[f"{name}_modes"].values, healpy.npix2nside(case.sizes["pixel"]))
+    return drawing.shown(case[f"{name}_modes"].values, lazy.healpy.npix2nside(case.sizes["pixel"]))
 
 
 def by_frequency(cases: Cases, metric: str) -> Figure:
@@ -119,7 +109,7 @@ def by_scenario(cases: Cases, metric: str) -> Figure:
     The fiducial scenario is black in all panels.
     """
     figure, panels = drawing.framed((12, 8), 2, 2, sharex=True, sharey=True)
-    for axes, (title, colour) in zip(panels.flat, COLOURS.items(), strict=True):
+    for axes, (title, colour) in zip(panels.flat, SHOWN["colours"].items(), strict=True):
         curve = cases["fiducial"][metric]
         axes.plot(curve["ell"][1:], curve[1:], color="black", lw=1.6, label="fiducial")
         members = {name: case for name, case in TABLE.items() if case.get("group") == title}
@@ -143,7 +133,7 @@ def scenario_maps(cases: Cases) -> Figure:
     """Figure 9: the true sky at 25 MHz and the map of every scenario, in the same colours."""
     truth = drawn(cases["fiducial"], "truth")
     norm, shown = drawing.temperatures(truth), [("truth", truth, None)]
-    for name in MAP_CASES:
+    for name in SHOWN["maps"]:
         case = TABLE[name]
         title = f"{case['group']}: {case['label']}" if "group" in case else name
         shown.append((title, drawn(cases[name], "mean"), cases[name]["highest_altitude"].values))

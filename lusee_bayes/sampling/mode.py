@@ -464,7 +464,7 @@ def sky_quantities(
     *,
     modes: Sequence[tuple[int, int]] = (),
     ells: Sequence[int] = (),
-    pixels: Mapping[str, tuple[float, float]] | None = None,
+    pixels: Mapping[str, Sequence[float]] | None = None,
 ) -> dict[str, Quantity]:
     """Compute chosen quantities of every draw, by name.
 
@@ -476,7 +476,7 @@ def sky_quantities(
         Modes (ell, m).
     ells : sequence of int
         Multipoles of powers C_ell.
-    pixels : mapping of (float, float), optional
+    pixels : mapping of sequences of float, optional
         Directions of brightnesses by name: Galactic longitude and latitude in degrees.
 
     Raises

@@ -33,7 +33,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -44,7 +43,7 @@ from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import harmonics_at, per_mode, require_nside
 from lusee_bayes.core.lazy import coordinates, healpy
-from lusee_bayes.core.reading import read_yaml
+from lusee_bayes.core.reading import table_beside
 
 Numbers = float | np.ndarray
 
@@ -145,15 +144,6 @@ class Region:
         middle = -(u @ w) / uu
         half = np.sqrt(np.maximum(middle**2 - (w @ w - 1.0) / uu, 0.0))
         return np.maximum(middle - half, 0.0), np.maximum(middle + half, 0.0)
-
-
-# Galactic longitude and latitude in degrees
-LANDMARKS = {
-    "Galactic centre": (0.0, 0.0),
-    "anticentre": (180.0, 0.0),
-    "north Galactic pole": (0.0, 90.0),
-    "south Galactic pole": (0.0, -90.0),
-}
 
 
 JANSKY = 1e-26  # W / m^2 / Hz
@@ -316,7 +306,8 @@ def _of_table(kind: type[T], rows: dict[str, list]) -> tuple[T, ...]:
     return tuple(kind(name, *row) for name, row in values.items())
 
 
-OBJECTS = read_yaml(Path(__file__).with_name("galaxy.yaml"), "the objects of the embedded sky")
+OBJECTS = table_beside(__file__)
+LANDMARKS: dict[str, list[float]] = OBJECTS["landmarks"]
 REGIONS = _of_table(Region, OBJECTS["regions"])
 EXTENDED_OBJECTS = _of_table(ExtendedObject, OBJECTS["extended"])
 BRIGHT_SOURCES = _of_table(PointSource, OBJECTS["sources"])
