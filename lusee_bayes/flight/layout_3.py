@@ -11,6 +11,7 @@ from astropy.io import fits
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import unread_image
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Unread
+from lusee_bayes.core.reading import table_beside
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, SAME_S, Clock
 from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Session, session_of
 from lusee_bayes.instrument.times import scale_of
@@ -26,21 +27,9 @@ CLOCK_WORDS = {
 LAYOUT_3 = Layout("a session of lusee.ingest, layout 3", ROWS, SAID | CLOCK_WORDS)
 # tables of FITS, and the prefixes of their columns' names in HDF5
 TABLES = {"SPECTRA_TIMES": "spectra", "SPECTRA_META": META, "SPEC_INTERP": "telemetry"}
-# columns and words that have another name in FITS
+# columns and words that have another name in FITS: words by table
 COLUMNS = {"spectra/RAW_TIME": "spectra/raw_times", "spectra/MJD_TIME": "spectra/mjd_times"}
-WORDS = {
-    ("CONSTANTS", "LUN_LAT"): "constants.lun_lat_deg",
-    ("CONSTANTS", "LUN_LON"): "constants.lun_long_deg",
-    ("CONSTANTS", "RAWSHFT"): "constants.raw_time_subtract_seconds",
-    ("CONSTANTS", "MJDOFF"): "constants.mjd_epoch_offset_days",
-    ("CONSTANTS", "TIMESYS"): "constants.time_scale",
-    ("SESSION_INV", "SW_VERS"): "session_invariants.software_version",
-    ("SPECTRA", "BUNIT"): "spectra/data.units",
-    ("SPECTRA", "REPRESENTATION"): "spectra/data.representation",
-    ("SPECTRA", "BITSREST"): "spectra/data.bitslice_restored",
-    ("SPECTRA", "BITSREF"): "spectra/data.bitslice_reference",
-    ("SPECTRA", "NORMVER"): "spectra/data.normalization_version",
-}
+WORDS: dict[str, dict[str, str]] = table_beside(__file__)
 
 
 def said_in(file: Mapping[str, Any]) -> dict[str, Any]:
@@ -102,8 +91,9 @@ def session_of_fits(path: Path, hdus: fits.HDUList) -> Session:
             arrays[COLUMNS.get(name, name)] = np.asarray(hdus[table].data[column])
     values: dict[str, Any] = {
         ours: hdus[hdu].header[word]
-        for (hdu, word), ours in WORDS.items()
-        if hdu in names and word in hdus[hdu].header
+        for hdu in [hdu for hdu in WORDS if hdu in names]
+        for word, ours in WORDS[hdu].items()
+        if word in hdus[hdu].header
     }
     return _checked_session(path, "FITS", arrays, values)
 

@@ -13,6 +13,7 @@ import numpy as np
 from lusee_bayes.core.arrays import Rows, Times
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Layout, Unread, Variable
+from lusee_bayes.core.reading import table_beside
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.layout_3 import no_spectra, said_in
 from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Session, session_of
@@ -23,17 +24,7 @@ LAYOUT_4 = Layout("a session of lusee.ingest, layout 4", ROWS, SAID)
 NAMES = [name.removeprefix(f"{META}/") for name in ROWS if name.startswith(META)]
 FIELDS = {name: name.lower() for name in (*NAMES, "actual_gain")}
 # groups of data other than spectra of all channels, and their names in messages
-UNUSED = {
-    "tr_spectra": "time-resolved spectra",
-    "calibrator/zoom_spectra": "zoom spectra",
-    "grimm_spectra": "Grimm's spectra",
-    "calibrator/metadata": "calibrator metadata",
-    "calibrator/data": "calibrator data",
-    "calibrator/raw_pfb": "calibrator's raw filter bank",
-    "calibrator/debug": "calibrator debug pages",
-    "waveform": "waveforms",
-    "housekeeping": "housekeeping",
-}
+UNUSED: dict[str, str] = table_beside(__file__)
 # ticks of the telemetry's clock in a second
 TICKS = 65536
 TELEMETRY_ARRAYS = {

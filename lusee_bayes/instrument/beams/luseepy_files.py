@@ -41,7 +41,7 @@ from jaxtyping import Complex, Float
 from scipy import fft, special
 from scipy.constants import Boltzmann, physical_constants, speed_of_light
 
-from lusee_bayes.core import arrays, formats, harmonics
+from lusee_bayes.core import arrays, formats, harmonics, reading
 from lusee_bayes.core.checks import Described, counted, extent
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.layouts import UNSTATED, Attribute, Layout, Variable
@@ -50,26 +50,12 @@ from lusee_bayes.instrument.beams.fields import AntennaFields, HemisphereGrid, P
 from lusee_bayes.instrument.beams.source import BeamSource, Circuit, JFETReceiver, Receiver
 from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices, to_real
 
-# conventions of the images that this package assumes, in lower case
-CONVENTIONS: Mapping[str, str] = {
-    "TIMECONV": "e+jwt",
-    "COORDSYS": "instrument-topocentric",
-    "THETADEF": "colatitude-from-+z",
-    "PHIDEF": "right-handed-about-+z",
-    "OMEGADEF": "source-arrival-direction",
-    "POLBASIS": "e_theta,e_phi",
-    "PORTS": "0123",
-    "CANONICAL": "h[m],si-rms",
-}
-# of responses: the input that luseepy converts to effective lengths in m, by NORM_KIND
+# words of headers that this package assumes, in lower case
+HEADERS = reading.table_beside(__file__)
+CONVENTIONS: Mapping[str, list[str]] = HEADERS["conventions"]
+# of responses: the input that luseepy converts to effective lengths, by NORM_KIND
 SOURCES = ("NORM_KIND", "INPUT_KIND", "FIELD_KIND", "FIELD_UNIT")
-CONVERTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
-    "already-effective-length": ("bare", "effective-length", ("m",)),
-    "already-per-ampere": ("bare", "re-per-current", ("v/a", "mv/a")),
-    "current": ("bare", "re", ("v", "mv")),
-    "vsource": ("embedded", "re", ("v", "mv")),
-    "unloaded-zl": ("loaded", "effective-length", ("m",)),
-}
+CONVERTED: Mapping[str, dict[str, list[str]]] = HEADERS["converted"]
 
 
 def require_conventions(path: str | Path, said: Mapping[str, Any]) -> None:
@@ -91,9 +77,7 @@ def require_conventions(path: str | Path, said: Mapping[str, Any]) -> None:
     stated = {key: text for key, text in stated.items() if text not in UNSTATED}
     kind = stated.get("NORM_KIND", "already-effective-length")
     require_known(f"{path}: NORM_KIND is", kind, CONVERTED)
-    source = dict(zip(SOURCES[1:], CONVERTED[kind], strict=True))
-    for key, expected in (CONVENTIONS | source).items():
-        allowed = (expected,) if isinstance(expected, str) else expected
+    for key, allowed in (CONVENTIONS | CONVERTED[kind]).items():
         if key in stated and stated[key] not in allowed:
             raise InputError(
                 f"{path}: {key} is '{said[key]}', expected '{' or '.join(allowed)}'; convert the "
