@@ -6,9 +6,8 @@ from rich.box import SIMPLE
 from rich.markup import escape
 from rich.table import Table
 
-from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows
+from lusee_bayes.results import finished_runs, sample_result
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, forecast_rows
-from lusee_bayes.results.sample_result import ValidationResult
 from lusee_bayes.sampling.validation import Check
 
 
@@ -45,7 +44,7 @@ def checks_table(checks: list[Check]) -> Table:
     table = Table("check", "value", "allowed", "", "meaning")
     for check in checks:
         verdict = "ok" if check.passed else "FAILED"
-        value, allowed = f"{check.value:.4g}", ValidationResult.allowed(check)
+        value, allowed = f"{check.value:.4g}", sample_result.ValidationResult.allowed(check)
         table.add_row(escape(check.name), value, allowed, verdict, escape(check.meaning))
     return table
 
@@ -60,7 +59,7 @@ def table_of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Ta
     return table
 
 
-def comparison_table(runs: Sequence[FinishedRun]) -> Table:
+def comparison_table(runs: Sequence[finished_runs.FinishedRun]) -> Table:
     """A comparison of finished runs."""
     header = "run", "MHz", "verdict", "SNR<1\nat ell", "bits", "ln\nevidence", "-\nbest"
     rows = [
@@ -75,6 +74,6 @@ def comparison_table(runs: Sequence[FinishedRun]) -> Table:
             f"{row['instrument_p']:.2g}",
             f"{row['prior_p']:.2g}",
         )
-        for run, row in zip(runs, comparison_rows(runs), strict=True)
+        for run, row in zip(runs, finished_runs.comparison_rows(runs), strict=True)
     ]
     return table_of_numbers((*header, "p\ninstr.", "p\nprior"), rows)

@@ -33,9 +33,8 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.radiometer import of_voltages
 from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
-from lusee_bayes.systematics import beam, noise_level, sources
+from lusee_bayes.systematics import beam, gain_drifts, noise_level, sources
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities
-from lusee_bayes.systematics.gain_drifts import GainDrifts, drift_within
 from lusee_bayes.systematics.systematic import Systematic
 
 
@@ -290,7 +289,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     return {
         "gaussian": lambda: to_sample()[0],
         "systematics": lambda: to_sample()[1],
-        "gain_drifts": lambda: built(GainDrifts),
+        "gain_drifts": lambda: built(gain_drifts.GainDrifts),
         "instrument": instrument,
         "sources": lambda: built(sources.PointSources),
         "layout": lambda: data.layout,
@@ -388,7 +387,7 @@ def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ..
                 f"{part.systematic.names[k]} is held at the end of its range, but data are more "
                 "probable beyond it: the errors of the map may not hold. Mistakes can look alike."
             )
-    if said := drift_within(setup.scenario.noise.gain, setup.observation):
+    if said := gain_drifts.drift_within(setup.scenario.noise.gain, setup.observation):
         notes.append(f"{said[0].upper()}{said[1:]}.")
     if setup.scenario.noise.radiometer.form == "exact":
         seen = noise_visibilities(setup, inference.around, noise_level.radiometer_about(setup))

@@ -25,11 +25,10 @@ from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, KnownFactor, LowRankUpdate
 from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.sky.sky_source import Sky
-from lusee_bayes.systematics import noise_level, registered, sources
+from lusee_bayes.systematics import gain_drifts, noise_level, registered, sources
 from lusee_bayes.systematics import systematic as kinds
 from lusee_bayes.systematics.above_lmax import AboveLmax, sky_above
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities, prior_and_family
-from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.horizon import Horizon
 from lusee_bayes.systematics.regolith import ground_per_kelvin
 
@@ -236,7 +235,7 @@ def in_noise(
         before = model
         if systematic.first_order:
             model = systematic.effect(model, systematic.values(systematic.centre(values)))
-        elif isinstance(systematic, GainDrifts):
+        elif isinstance(systematic, gain_drifts.GainDrifts):
             model = systematic.averaged(model)
         stages.append((systematic, before, model.coupling.response))
     last, held = model.coupling.response, []

@@ -28,9 +28,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.engine import in_threads
+from lusee_bayes.core import engine, lazy
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.model import base_model, systematics
 from lusee_bayes.experiment.rounds import Inference, approached, less_moved, settled, solved_at
 from lusee_bayes.instrument.pointing import CLOCK, offset_kind
@@ -113,7 +112,7 @@ class Draws(NamedTuple):
             linear[k] = inference.model.predict(skies[k]) + columns @ steps[k]
             beyond[k] = model.predict(skies[k]) - linear[k]
 
-        in_threads(draw, range(len(skies)))
+        engine.in_threads(draw, range(len(skies)))
         return cls(steps, linear, beyond)
 
     def moves(self, inference: Inference) -> float:
@@ -200,4 +199,4 @@ def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float
     weights = np.exp(log_weights - log_weights.max())
     if weights.sum() ** 2 < 2.0 * (weights**2).sum():  # one draw has nearly all weight: no tail
         return np.inf, moved_by
-    return float(arviz_stats.array_stats.psislw(-log_weights)[1]), moved_by
+    return float(lazy.arviz_stats.array_stats.psislw(-log_weights)[1]), moved_by

@@ -13,9 +13,8 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lusee_bayes.core import checks, harmonics
+from lusee_bayes.core import checks, harmonics, lazy
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, kinds_of, one_of, requires
 from lusee_bayes.priors import families, local_scales
@@ -126,7 +125,7 @@ class SurveySection(Section):
         """
         file = require_file(self.file, "survey", "check prior.surveys")
         sky, unseen = sky_source.read_sky_file(file, self.dataset), None
-        beam = harmonics.per_mode(healpy.gauss_beam(np.radians(self.beam_deg), lmax))
+        beam = harmonics.per_mode(lazy.healpy.gauss_beam(np.radians(self.beam_deg), lmax))
         if isinstance(sky, sky_source.SkyMap):
             gaps = sky.unseen
             if self.mask_file is not None:
@@ -139,11 +138,11 @@ class SurveySection(Section):
                 raise InputError(why)
             if gaps.any():
                 template = sky_source.galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
-                filled = harmonics.modes_to_map(beam * template, healpy.npix2nside(gaps.size))
+                filled = harmonics.modes_to_map(beam * template, lazy.healpy.npix2nside(gaps.size))
                 filled *= sky.pixels[~gaps].mean() / filled[~gaps].mean()
                 # a sharp edge would be amplified where the beam is taken off
                 width = np.radians(max(self.beam_deg, EDGE_DEG))
-                near = healpy.smoothing(gaps.astype(float), width)
+                near = lazy.healpy.smoothing(gaps.astype(float), width)
                 weight = np.where(gaps, 0.0, np.clip(1.0 - 2.0 * near, 0.0, 1.0) ** 2)
                 pixels = filled + weight * (sky.pixels - filled)
                 sky, unseen = replace(sky, pixels=pixels), weight < SEEN

@@ -28,9 +28,8 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
+from lusee_bayes.core import checks, linalg
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, Square
-from lusee_bayes.core.checks import with_error
-from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, true_values
@@ -175,7 +174,7 @@ class UnknownsReport:
 def _line(name: str, row: Mapping[str, Any]) -> str:
     """Format a row of a table as text."""
     unit = f" {row['unit']}" if row.get("unit") else ""
-    text = f"{name}: {with_error(row['value'], row['std'])}{unit}"
+    text = f"{name}: {checks.with_error(row['value'], row['std'])}{unit}"
     if row["std"] > UNTOLD * row["prior_std"]:
         text += f" (unconstrained: prior +- {row['prior_std']:.2g})"
     return text
@@ -457,9 +456,9 @@ class SkyAbove:
         if not roots:
             return None
         above, n = setup.above, setup.prior.size
-        lower = checked_cholesky("the prior above lmax", above.covariance)
+        lower = linalg.checked_cholesky("the prior above lmax", above.covariance)
         own = np.column_stack([above.root[n:], above.modes - above.mean[n:]])
-        directions, model = np.split(solve_lower(lower, own, transpose=False), [-1], axis=1)
+        directions, model = np.split(linalg.solve_lower(lower, own, transpose=False), [-1], axis=1)
         columns = np.concatenate([*(part.columns for part in inference.expanded), *roots], axis=1)
         amplitudes = AmplitudesOfSky.of(inference.solution, columns)
         given = amplitudes.integrated(np.asarray(wide.mean), np.asarray(wide.covariance()))
@@ -671,7 +670,7 @@ def flux_lines(fluxes: pd.DataFrame) -> Iterator[str]:
     """One line per source, or per block of it."""
     for row in fluxes.to_dict("records"):
         name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"
-        text = f"{name}: {with_error(row['flux_jy'], row['std_jy'])} Jy"
+        text = f"{name}: {checks.with_error(row['flux_jy'], row['std_jy'])} Jy"
         if not row["above_horizon"]:
             text += " (prior: never above the horizon)"
         yield text

@@ -19,10 +19,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lusee_bayes.core import lazy, linalg
 from lusee_bayes.core.arrays import Ells, Modes, Pixels, Vector
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, modes_to_map, sum_over_m
-from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.linalg import invert_lower
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.judge.coverage import latitudes, multipoles
 from lusee_bayes.linear.linear_gaussian import Solution
@@ -82,7 +81,7 @@ def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str,
         By name of the part; parts that the data do not constrain are omitted.
     """
     rest = np.where(np.arange(len(deviation)) > 0, deviation, 0.0)
-    nside = healpy.npix2nside(len(of_pixels))
+    nside = lazy.healpy.npix2nside(len(of_pixels))
     seen, (*bands, _) = modes_to_map(rest, nside), latitudes(nside).items()
     _, *ells = multipoles(lmax_of(len(deviation))).items()
     parts = [(*band, seen, of_pixels) for band in bands] + [(*ell, rest, of_modes) for ell in ells]
@@ -215,7 +214,7 @@ def expected_chi2(posterior: Posterior, n_data: int, variance: Modes | None = No
     if variance is not None and prior.independent and posterior.basis is None:
         power = np.asarray(prior.variance())
         return float(n_data - (1.0 - variance[power > 0] / power[power > 0]).sum())
-    inverse = invert_lower(np.asarray(posterior.lower))
+    inverse = linalg.invert_lower(np.asarray(posterior.lower))
     return n_data - len(inverse) + float(np.vdot(inverse, inverse))
 
 
@@ -244,7 +243,7 @@ def highest_altitude(
         Sine of the altitude above the horizon, of Galactic pixels in RING order. Negative where the
         sky never rose: there the map comes from the prior alone.
     """
-    directions = np.array(healpy.pix2vec(nside, np.arange(healpy.nside2npix(nside))))
+    directions = np.array(lazy.healpy.pix2vec(nside, np.arange(lazy.healpy.nside2npix(nside))))
     turns = observation.topocentric_from_mcmf() @ observation.mcmf_from_galactic[seen]
     highest = np.full(directions.shape[1], -1.0)
     for chunk in np.array_split(turns, max(1, len(turns) // 64)):

@@ -13,10 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core import checks, harmonics, linalg
+from lusee_bayes.core import checks, harmonics, lazy, linalg
 from lusee_bayes.core.arrays import Array, ModesMatrix, Pixels, compiled, namespace
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sky.prior import Prior
 
 Degrees = Sequence[float] | Float[np.ndarray, " n"]
@@ -350,7 +349,7 @@ def _rings(nside: int, lmax: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Rings are padded to the longest one, with their last pixel.
     """
-    theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
+    theta, phi = lazy.healpy.pix2ang(nside, np.arange(lazy.healpy.nside2npix(nside)))
     heights, first, count = np.unique(theta, return_index=True, return_counts=True)
     place = np.minimum(np.arange(count.max())[None], count[:, None] - 1) + first[:, None]
     return heights, place, harmonics.azimuth_functions(phi, lmax)[place]

@@ -21,10 +21,9 @@ from astropy.io import fits
 from jaxtyping import Bool, Float
 from pydantic import BaseModel
 
-from lusee_bayes.core import arrays, formats, harmonics
+from lusee_bayes.core import arrays, formats, harmonics, lazy
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover, require_files, user_path
-from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import read_model, require_file
 from lusee_bayes.core.trees import from_tree, opened_tree, to_tree
 from lusee_bayes.core.version import COMMAND, __version__, release, versions
@@ -105,7 +104,7 @@ def _write_columns(
     named = {"column_names": [name.upper() for name in names], "column_units": units}
     extra = [(key, *card) for key, card in header.items()]
     dtypes = [one.dtype for one in pixels]
-    healpy.write_map(path, pixels, coord="G", dtype=dtypes, extra_header=extra, **named)
+    lazy.healpy.write_map(path, pixels, coord="G", dtype=dtypes, extra_header=extra, **named)
 
 
 def write_cubes(

@@ -15,10 +15,9 @@ import pandas as pd
 from astropy.table import Table
 from jaxtyping import Float
 
-from lusee_bayes.core import harmonics, progress
+from lusee_bayes.core import harmonics, lazy, progress
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import Described, counted, extent, with_error
-from lusee_bayes.core.lazy import healpy
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import flux_lines
@@ -324,8 +323,8 @@ class MapResult(Described):
     def landmarks(self) -> dict[str, dict[str, np.ndarray]]:
         """Brightness, its standard deviation and, if known, its truth in some directions."""
         nside, truth = self.scenario.map_nside, self.stacked("truth")
-        pixels = healpy.ang2pix(nside, *np.transpose([*LANDMARKS.values()]), lonlat=True)
-        y = harmonics.synthesis_matrix(*healpy.pix2ang(nside, pixels), self.scenario.lmax).T
+        pixels = lazy.healpy.ang2pix(nside, *np.transpose([*LANDMARKS.values()]), lonlat=True)
+        y = harmonics.synthesis_matrix(*lazy.healpy.pix2ang(nside, pixels), self.scenario.lmax).T
         values = {"mean": self.stacked("mean") @ y, "std": self.stacked("pixel_std")[:, pixels]}
         if truth is not None:
             values["truth"] = truth @ y

@@ -24,9 +24,8 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import curve_fit
 from scipy.stats import foldnorm
 
-from lusee_bayes.core import arrays, linalg, reading
+from lusee_bayes.core import arrays, layouts, linalg, reading
 from lusee_bayes.core.errors import InputError, refusing
-from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.results.sky_spectrum import OBSERVED, Frequencies, SkySpectrum
@@ -38,10 +37,10 @@ DETECTED, LEVEL = 5.0, 0.95
 Columns = Float[np.ndarray, "_ _"]
 TERM = "the next term of the polynomial"
 TEMPLATE_COLUMNS = {
-    "frequency_mhz": Variable(("frequency",), grows=True),
-    "temperature_k": Variable(("frequency",)),
+    "frequency_mhz": layouts.Variable(("frequency",), grows=True),
+    "temperature_k": layouts.Variable(("frequency",)),
 }
-TABLE = Layout("a template of a signal", TEMPLATE_COLUMNS)
+TABLE = layouts.Layout("a template of a signal", TEMPLATE_COLUMNS)
 
 
 @dataclass(frozen=True)

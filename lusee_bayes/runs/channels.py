@@ -43,12 +43,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import formats
+from lusee_bayes.core import formats, trees
 from lusee_bayes.core.arrays import T
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.trees import StoredTree, from_tree, write_tree
 from lusee_bayes.experiment.data_files import Data, anchored, digest_of
 from lusee_bayes.experiment.experiment import build, draw_key
 from lusee_bayes.experiment.scenario import Scenario
@@ -58,10 +57,9 @@ from lusee_bayes.linear import joint, positive_joint
 from lusee_bayes.linear.amplitudes import AlikeAbove, AlikeErrors, Tied, kernel, tie
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.results import sky_spectrum
+from lusee_bayes.results import finished_runs, sky_spectrum
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
-from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import identity_of
@@ -101,14 +99,14 @@ class ChannelFiles:
         if formats.says(path, {"identity": self.identity}):
             return self.read(channel, kind)
         made = make()
-        write_tree(path, made, formats.CHANNEL, {"identity": self.identity})
+        trees.write_tree(path, made, formats.CHANNEL, {"identity": self.identity})
         return made
 
     def read(self, channel: Scenario, kind: type[T]) -> T:
         """Read a stored dataclass."""
         path = self.path(channel, kind)
         with h5py.File(path) as file:
-            return from_tree(kind, StoredTree(file), str(path))
+            return trees.from_tree(kind, trees.StoredTree(file), str(path))
 
     def information(self, channel: Scenario, number: int, tied: Tied | None) -> Information:
         """Read the information of a :class:`ChannelInformation`, with common unknowns if any."""
@@ -590,12 +588,12 @@ def map_channels(
     engine, stages, single = engine or ThisProcess(), stages or Stages(), scenario.single
     # workers may have another working directory
     data = None if data is None else anchored(data)
-    kept = None if earlier is None else information_file(earlier)
+    kept = None if earlier is None else finished_runs.information_file(earlier)
 
     def condition(
         channel: Scenario, progress: Stages, values: dict[str, float] | None = None
     ) -> Conditioned:
-        before = None if kept is None else read_information(kept, channel)
+        before = None if kept is None else finished_runs.read_information(kept, channel)
         make = partial(build, earlier=None if before is None else before.information, values=values)
         experiment = measured_experiment(channel, data, progress, truth=truth, make=make)
         return conditioned(experiment, before, progress)

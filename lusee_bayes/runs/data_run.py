@@ -15,9 +15,8 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import require_new, transaction, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
-from lusee_bayes.experiment import data_files, experiment
+from lusee_bayes.experiment import data_files, experiment, model
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
-from lusee_bayes.experiment.model import require_fitting, set_up, simulate
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.gain_model import write_gain_table
@@ -78,9 +77,9 @@ def run_simulate(
         )
     channels = (scenario,) if scenario.single else scenario.channels()
     cost.require_fits(cost.simulation_cost(scenario, len(channels)), scenario)
-    setups = [set_up(channel, stages=stages) for channel in channels]
+    setups = [model.set_up(channel, stages=stages) for channel in channels]
     with stages("noise"):
-        data = [simulate(setup) for setup in setups]
+        data = [model.simulate(setup) for setup in setups]
     if is_waterfall:
         _write_waterfall(path, data, setups, scenario)
     else:
@@ -387,7 +386,7 @@ def run_average(
         fine = data_files.read_data(data, scenario)
         with naming(data_files.names_of_data(data)[0]):
             coarse = averaged(fine, to_s)
-    require_fitting(fine, scenario)
+    model.require_fitting(fine, scenario)
     if said := gain_drifts.drift_within(scenario.noise.gain, coarse.observation):
         raise InputError(said)
     if information:

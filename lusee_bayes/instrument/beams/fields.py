@@ -22,11 +22,10 @@ import numpy as np
 import scipy
 from jaxtyping import Complex, Float, Inexact
 
-from lusee_bayes.core import checks
+from lusee_bayes.core import checks, lazy
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, lmax_of, mode_numbers, polar_functions
-from lusee_bayes.core.lazy import healpy
 from lusee_bayes.instrument.products import antennas_of, auto_indices, labels_of, to_real
 
 # responses of antennas, and of pairs of them, in any directions
@@ -455,9 +454,9 @@ def from_rings(
     (..., theta, phi) array
         Complex if the pixels are.
     """
-    nside = healpy.npix2nside(pixels.shape[-1])
-    starts, sizes, *_ = healpy.ringinfo(nside, np.arange(1, 2 * nside))
-    ring_theta, first_phi = healpy.pix2ang(nside, starts)
+    nside = lazy.healpy.npix2nside(pixels.shape[-1])
+    starts, sizes, *_ = lazy.healpy.ringinfo(nside, np.arange(1, 2 * nside))
+    ring_theta, first_phi = lazy.healpy.pix2ang(nside, starts)
     orders = np.arange(1 - 2 * nside, 2 * nside)
     # f_m of every ring; orders for which a ring has too few pixels are not used
     series = np.zeros((*pixels.shape[:-1], len(sizes), len(orders)), dtype=np.complex128)

@@ -23,10 +23,9 @@ from jaxtyping import Complex, Float
 from pydantic import BeforeValidator, Field
 from scipy.constants import Boltzmann
 
-from lusee_bayes.core import formats, layouts
+from lusee_bayes.core import formats, layouts, lazy
 from lusee_bayes.core.arrays import Array, Values
 from lusee_bayes.core.errors import require_known
-from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.core.section import LARGEST, Positive, Section
 from lusee_bayes.instrument.beams import fields as beam_fields
 from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices, to_real
@@ -509,4 +508,4 @@ def _splines(source: BeamSource, frequency_mhz: float, stokes: str) -> list[Any]
     beams = np.asarray(to_real(patterns)) * source.pattern_scale(frequency_mhz)
     around = np.pad(beams, ((0, 0), (0, 0), (MARGIN, MARGIN)), "wrap")
     phi = 2.0 * np.pi / N_PHI * np.arange(-MARGIN, N_PHI + MARGIN)
-    return [interpolate.RectBivariateSpline(theta, phi, one) for one in around]
+    return [lazy.interpolate.RectBivariateSpline(theta, phi, one) for one in around]

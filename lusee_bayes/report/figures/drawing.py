@@ -26,10 +26,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage, imsave
 from matplotlib.text import Text
 
+from lusee_bayes.core import lazy, version
 from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map, per_mode, taper
-from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.version import printable
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 
 # safe for colour-blind readers: perceptually uniform, and a blue-orange pair (Okabe-Ito) for lines
@@ -63,7 +62,7 @@ def _drawn(figure: Figure, dpi: int) -> memoryview:
     """The pixels of a figure."""
     figure.set_dpi(dpi)
     for text in figure.findobj(Text):
-        text.set_text(printable(text.get_text()))
+        text.set_text(version.printable(text.get_text()))
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return canvas.buffer_rgba()
@@ -261,7 +260,7 @@ def view(pixels: Pixels) -> Float[np.ndarray, "height width"]:
         From the South pole up, and from l = 180 degrees at the left; points beyond the rim have the
         rim's values.
     """
-    neighbours, weights = _projection(healpy.npix2nside(len(pixels)))
+    neighbours, weights = _projection(lazy.healpy.npix2nside(len(pixels)))
     return np.einsum("kp,kp->p", weights, np.asarray(pixels)[neighbours]).reshape(WIDTH // 2, WIDTH)
 
 
@@ -271,7 +270,7 @@ def _projection(nside: int) -> tuple[np.ndarray, np.ndarray]:
     x = (np.arange(WIDTH) + 0.5) / WIDTH * 2.0 - 1.0
     y = (np.arange(WIDTH // 2) + 0.5) / (WIDTH // 2) * 2.0 - 1.0
     x, y = (grid.ravel() for grid in np.meshgrid(x, y))
-    return healpy.get_interp_weights(nside, *unprojected(x, y), lonlat=True)
+    return lazy.healpy.get_interp_weights(nside, *unprojected(x, y), lonlat=True)
 
 
 def unprojected(
@@ -305,7 +304,7 @@ def rim(highest_altitude: Pixels) -> list[Float[np.ndarray, "points 2"]]:
         sin of the highest altitude of each pixel.
     """
     lon, lat = np.linspace(-180.0, 180.0, 361), np.linspace(-90.0, 90.0, 181)
-    heights = healpy.get_interp_val(highest_altitude, *np.meshgrid(lon, lat), lonlat=True)
+    heights = lazy.healpy.get_interp_val(highest_altitude, *np.meshgrid(lon, lat), lonlat=True)
     return contour_generator(lon, lat, heights).lines(0.0)
 
 
