@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from astropy.time import Time
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core import checks, files, formats, reading
 from lusee_bayes.core.arrays import Array

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from lusee_bayes.core import checks, linalg
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.instrument.products import Columns, DataLayout
 from lusee_bayes.noise.covariance import CholeskyFactor, Covariance, DiagonalCovariance, Factor
 
 Band = Float[Array, "times widths products products"]
