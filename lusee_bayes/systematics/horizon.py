@@ -149,7 +149,7 @@ class Horizon(ChangedBeams):
     """
 
     key, section, words, unit = "noise.horizon", HorizonSection, "the horizon", "deg"
-    moves_setup = True
+    moves_setup, in_common = True, True
 
     unknowns: tuple[Unknown, ...] = eqx.field()
     patterns: Float[Array, "products rings azimuths"]
@@ -159,10 +159,6 @@ class Horizon(ChangedBeams):
     highest: float = eqx.field(static=True)
     lmax: int = eqx.field(static=True)
     moon_k: float = eqx.field(static=True)
-
-    @classmethod
-    def octaves(cls, section: HorizonSection) -> float:
-        return np.inf
 
     @classmethod
     def build(cls, section: HorizonSection, setup: Setup, around: Around) -> "Horizon":

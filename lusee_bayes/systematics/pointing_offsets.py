@@ -104,7 +104,7 @@ class PointingOffsets(Systematic):
     """
 
     key, section, words, draw = "noise.pointing", PointingSection, "clock and pointing", 7
-    moves, moves_setup, has_table = True, True, True
+    moves, moves_setup, in_common, has_table = (True,) * 4
 
     unknowns: tuple[Unknown, ...] = eqx.field()
     expansion_point: Float[Array, "2"]
@@ -113,10 +113,6 @@ class PointingOffsets(Systematic):
     mcmf_from_lander: Float[Array, "3 3"]
     layout: DataLayout
     sources: MovingSources | None = None
-
-    @classmethod
-    def octaves(cls, section: PointingSection) -> float:
-        return np.inf
 
     @classmethod
     def build(cls, section: PointingSection, setup: Setup, around: Around) -> PointingOffsets:

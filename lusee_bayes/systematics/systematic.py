@@ -199,6 +199,8 @@ class Systematic(eqx.Module):
         Whether :meth:`moved` includes all effects of its true values on simulated data.
     scales_sky : bool
         Whether its effect is a factor of all visibilities.
+    in_common : bool
+        Whether all channels share the values of its unknowns.
     has_table : bool
         Whether reports have a separate table of its unknowns.
     learns : bool
@@ -210,7 +212,7 @@ class Systematic(eqx.Module):
     draw: ClassVar[int | None] = None
     key, words, unit = "", "a systematic", ""
     changes_coupling, first_order = True, True
-    needs_sky, moves, moves_setup, scales_sky, has_table, learns = (False,) * 6
+    needs_sky, moves, moves_setup, scales_sky, in_common, has_table, learns = (False,) * 7
 
     # --- in a scenario ---
 
@@ -251,7 +253,7 @@ class Systematic(eqx.Module):
 
         Zero if every channel has its own, infinity if all channels share one value.
         """
-        return 0.0
+        return np.inf if cls.in_common else 0.0
 
     @classmethod
     def true_seed(cls, section: Any, scenario: Any) -> int:
