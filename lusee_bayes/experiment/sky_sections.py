@@ -8,7 +8,7 @@ that is a :class:`SkySource` or has a :class:`Prior`, and add it to ``SKY_SECTIO
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -24,6 +24,10 @@ from lusee_bayes.sky.positive_skies import PositiveSkies
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_spectrum
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
+
+# parts of skies at several frequencies: keys of SPECTRA and FIELDS
+Component = Literal["power_law", "curvature", "turnover"]
+SkyField = Literal["level", "index", "curvature", "absorption"]
 
 
 class GalaxySection(Section, sky_source.SkySource):
@@ -344,12 +348,8 @@ class SpectralSection(Section):
     """
 
     model: Literal["components", "positive"] = "components"
-    components: Annotated[
-        tuple[Literal["power_law", "curvature", "turnover"], ...], Field(min_length=1)
-    ] = ("power_law", "curvature", "turnover")
-    fields: Annotated[
-        tuple[Literal["level", "index", "curvature", "absorption"], ...], Field(min_length=1)
-    ] = ("level", "index", "curvature", "absorption")
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = get_args(Component)
+    fields: Annotated[tuple[SkyField, ...], Field(min_length=1)] = get_args(SkyField)
     sources: bool = True
     index: Annotated[float, Field(ge=-20, le=20)] = -2.5
     reference_mhz: Megahertz = 20.0
