@@ -670,12 +670,9 @@ def map_channels(
     if scenario.joint:
         tied, misfit = _with_sky_above(tied, mapped, files)
         at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
-        components, posterior = solve_components(
-            _without(unmapped, scenario),
-            at_hand,
-            seen,
-            max(scenario.output.draws, sky_spectrum.N_DRAWS),
-        )
+        n_draws = max(scenario.output.draws, sky_spectrum.N_DRAWS)
+        fewer = _without(unmapped, scenario)
+        components, posterior = solve_components(fewer, at_hand, seen, n_draws)
         components = replace(components, misfit_above=misfit)
 
     def finish(channel: Scenario) -> None:
