@@ -179,6 +179,8 @@ def _is_inside(name: str) -> str:
 
 # a name inside the folder, not the folder itself
 _Inside = Annotated[str, AfterValidator(_is_inside)]
+# everything that determines the numbers of a run, as text by name
+Origin = Mapping[str, str]
 
 
 class _Manifest(BaseModel):
@@ -210,10 +212,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 @contextmanager
 def transaction(
-    folder: str | Path,
-    kind: str,
-    discard: Sequence[str] = (),
-    origin: Mapping[str, str] | None = None,
+    folder: str | Path, kind: str, discard: Sequence[str] = (), origin: Origin | None = None
 ) -> Iterator[Path]:
     """Write a run's results into a folder: all of them take effect at once, or none does.
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import jax
 from astropy.table import Table
 from matplotlib.figure import Figure
 from pandas import DataFrame
@@ -28,8 +29,6 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures.drawing import named_parts, save
 from lusee_bayes.report.pages import PAGES, REPORT
 from lusee_bayes.results.finished_runs import Provenance, text_hash
-
-Origin = Mapping[str, str]
 
 
 def origin_of(
@@ -76,18 +75,10 @@ def inputs_of(
     scenario: Scenario | None, data: Data | None = None, *others: str | Path | None
 ) -> list[str | Path]:
     """The files that a run reads: data, files named by its scenario, and others if given."""
-    named = () if scenario is None else _texts(scenario.model_dump(mode="json"))
+    tree = {} if scenario is None else scenario.model_dump(mode="json")
+    named = [one for one in jax.tree.leaves(tree) if isinstance(one, str)]
     given = [] if data is None else files_of(data)
     return [*given, *filter(os.path.isfile, named), *filter(None, others)]
-
-
-def _texts(tree: Any) -> Iterator[str]:
-    """All texts of a tree of mappings and lists."""
-    if isinstance(tree, str):
-        yield tree
-    elif isinstance(tree, Mapping | list):
-        for value in tree.values() if isinstance(tree, Mapping) else tree:
-            yield from _texts(value)
 
 
 def _entries(tree: Mapping[str, Any], parents: str = "") -> Iterator[tuple[str, Any]]:
@@ -98,7 +89,7 @@ def _entries(tree: Mapping[str, Any], parents: str = "") -> Iterator[tuple[str, 
             yield f"{parents}{key}", value
 
 
-def require_own(folder: Path, kinds: Sequence[str], origin: Origin) -> None:
+def require_own(folder: Path, kinds: Sequence[str], origin: files.Origin) -> None:
     """Check that a folder has no results of another run.
 
     Parameters
@@ -254,7 +245,7 @@ class RunFolder:
 
     path: Path
     kind: RunKind
-    origin: Origin
+    origin: files.Origin
 
     def write(
         self, result: Result, stages: progress.Stages, provenance: Provenance | None = None
