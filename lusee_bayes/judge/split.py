@@ -37,11 +37,7 @@ class Split:
 
     @classmethod
     def of(
-        cls,
-        posterior: Posterior,
-        chi2: float,
-        n_data: int,
-        matrix: ModesMatrix | None = None,
+        cls, posterior: Posterior, chi2: float, n_data: int, matrix: ModesMatrix | None = None
     ) -> "Split":
         """Split chi^2 of the data behind a posterior.
 
