@@ -31,7 +31,6 @@ from lusee_bayes.core.arrays import Ells, Grid, Square
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, mode_numbers, n_modes, turn_about_z
 from lusee_bayes.core.linalg import solve_lower
-from lusee_bayes.core.reading import table_beside
 from lusee_bayes.experiment.model import full_model, moved
 from lusee_bayes.experiment.rounds import Inference, as_expected
 from lusee_bayes.experiment.scenario import load_scenario
@@ -56,7 +55,14 @@ Columns = Float[np.ndarray, " columns"]
 Mixing = Float[np.ndarray, "products products"]
 
 # mistakes in the clock, and the seconds to add to the times
-CLOCKS: dict[str, float] = table_beside(__file__)
+CLOCKS = {
+    "the times are TT or TDB, not UTC": -69.184,
+    "the times are TAI, not UTC": -37.0,
+    "the times are an hour early": 3600.0,
+    "the times are an hour late": -3600.0,
+    "the times are a day early": 86400.0,
+    "the times are a day late": -86400.0,
+}
 
 
 class DataMistake(NamedTuple):

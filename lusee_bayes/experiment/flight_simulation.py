@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from lusee_bayes.core import engine, progress, reading
+from lusee_bayes.core import engine, progress
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.data_files import gain_table_of, per_kelvin_of
 from lusee_bayes.experiment.model import set_up, true_signal, true_values
@@ -39,7 +39,14 @@ ADC_RMS, ADC_PEAK = {"L": 55.0, "M": 310.0, "H": 1700.0}, 4.6
 SATURATED_RMS, OUT_OF_RANGE = 6200.0, 1000
 SOFTWARE = 0x307
 # telemetry: mean, amplitude and period in hours
-TELEMETRY: dict[str, list[float]] = reading.table_beside(__file__)
+TELEMETRY = {
+    "THERM_FPGA": (30.0, 2.0, 700.0),
+    "SPE_ADC0_T": (29.5, 1.5, 650.0),
+    "SPE_ADC1_T": (28.5, 1.5, 600.0),
+    "SPE_1VAD8_V": (1.8, 2e-3, 90.0),
+    "VMON_1V2D": (1.2, 2e-3, 130.0),
+    "SPE_1VAD8_C": (0.045, 1e-3, 110.0),
+}
 
 
 @dataclass(frozen=True, eq=False)

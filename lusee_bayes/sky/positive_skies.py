@@ -28,7 +28,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import checks, reading, sphere_grid
+from lusee_bayes.core import checks, sphere_grid
 from lusee_bayes.core.arrays import Array, Vector
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE
@@ -236,8 +236,14 @@ class PositiveSkies(eqx.Module):
         return self.grid.product_matrix(self.weight * self.values(channel, exponent), self.lmax)
 
 
-# A of each field and the width of its mean
-EXPECTED: dict[str, list[float]] = reading.table_beside(__file__)
+# A of each field, whose rms over the sky is seven times that, and the width of its mean: a template
+# accurate to a fifth (its mean to a half), indices to 0.06, optical depths to a fifth
+EXPECTED = {
+    "level": (0.03, 0.5),
+    "index": (0.01, 0.2),
+    "curvature": (0.005, 0.1),
+    "absorption": (0.03, 0.5),
+}
 RESIDUAL, TILT = 0.003, -2.4
 # prior standard deviations of ln A and the tilt
 LOG_WIDTH, TILT_WIDTH = 1.5, 0.5
