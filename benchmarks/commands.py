@@ -23,6 +23,7 @@ from scipy.linalg.lapack import dpotrf
 N_DATA, N_MODES = 5232, 2304
 YEAR = ["--set", "observation.step_s=600", "--set", "observation.runs=[{{cycles: 13.3683}}]"]
 CHANNELS = ["--frequencies", "5:50:1", "--draws", "20"]
+LEARNED = ["--set", "prior.model=local_scales", "--draws", "8"]
 MEANS = ["--set", "observation.window=mean"]
 POINTING = ["--set", "noise.pointing={{turntable_deg: 0.3, tilt_east_deg: 0.2, clock_s: 60}}"]
 COMMANDS = {
@@ -33,12 +34,21 @@ COMMANDS = {
     "map fiducial": ["map", "fiducial", "-o", "{map}"],
     "map, means over windows": ["map", "fiducial", *MEANS, "-o", "{means}"],
     "map, clock and pointing": ["map", "fiducial", *MEANS, *POINTING, "-o", "{pointing}"],
+    "map, default prior": ["map", "fiducial", *LEARNED, "-o", "{learned}"],
     "46 channels, each by itself": ["map", "fiducial", *CHANNELS, "-o", "{cube}"],
     "46 channels, joint": ["map", "fiducial", *CHANNELS, "--joint", "-o", "{joint}"],
+    "46 channels, default prior": [
+        "map",
+        "fiducial",
+        *CHANNELS,
+        *LEARNED[:2],
+        "-o",
+        "{channels}",
+    ],
     "a year every ten minutes": ["map", "fiducial", *YEAR, "-o", "{year}"],
 }
 COLD = ("map fiducial",)
-FOLDERS = ("map", "means", "pointing", "cube", "joint", "year")
+FOLDERS = ("map", "means", "pointing", "learned", "cube", "joint", "channels", "year")
 
 
 def unit() -> float:
