@@ -471,27 +471,41 @@ class SkyAbove:
         return float((1.0 - np.diagonal(self.covariance)).sum())
 
 
-def in_common(unknowns: Unknowns | None, above: SkyAbove | None, tied: Tied, number: int) -> Shared:
+def amplitudes_of(
+    unknowns: Unknowns | None, above: SkyAbove | None, reference: Modes
+) -> AmplitudesOfSky:
+    """All amplitudes of a channel given its sky: none, if there is nothing beside this sky."""
+    if (given := unknowns if above is None else above) is not None:
+        return given.amplitudes
+    return AmplitudesOfSky(np.zeros(0), np.zeros((0, len(reference))), np.zeros((0, 0)), reference)
+
+
+def in_common(
+    unknowns: Unknowns | None, above: SkyAbove | None, tied: Tied, number: int, reference: Modes
+) -> Shared:
     """What a channel has in common with the others of a joint posterior, given its sky.
 
     Parameters
     ----------
     unknowns : Unknowns or None
     above : SkyAbove or None
-        If ``tied`` has the sky above lmax.
+        None if the channel's model ends at lmax.
     tied : Tied
         Prior of the common unknowns.
     number : int
         Index of the channel in ``tied``.
+    reference : (modes,) array
+        A sky in K, about which a channel without such unknowns is described.
     """
-    given = unknowns.amplitudes if above is None else above.amplitudes
+    given = amplitudes_of(unknowns, above, reference)
     mean, turn, root = given.mean.copy(), np.zeros((len(given.mean), 0)), np.zeros((0, 0))
     if unknowns is not None:
         mean[: len(unknowns.expected)] += unknowns.expected
         turn = np.eye(len(mean))[:, unknowns.shared]
         root = tied.prior_root[number, unknowns.among(tied)]
     if tied.above is not None:
-        alike = tied.above.root(number, above.directions)
+        directions = tied.above.directions[:, :0] if above is None else above.directions
+        alike = tied.above.root(number, directions)
         turn = np.hstack([turn, np.pad(alike, ((len(mean) - len(alike), 0), (0, 0)))])
         root = block_diag(root, np.eye(alike.shape[1]))
     across = given.covariance @ turn

@@ -51,7 +51,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, anchored, digest_of
 from lusee_bayes.experiment.experiment import build, draw_key
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.unknowns import SkyAbove, Unknowns, in_common
+from lusee_bayes.experiment.unknowns import SkyAbove, Unknowns, amplitudes_of, in_common
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
 from lusee_bayes.linear.amplitudes import AlikeAbove, AlikeErrors, Tied, kernel, tie
@@ -149,7 +149,8 @@ class ChannelInformation:
         """The information, with what the channel has in common with the others, if anything."""
         if tied is None:
             return self.information
-        return in_common(self.unknowns, self.above, tied, number).information(self.information)
+        given = self.unknowns, self.above, tied, number, np.asarray(self.information.reference)
+        return in_common(*given).information(self.information)
 
     def seen(self) -> Seen:
         """Inputs for the joint posterior: share, reference sky and model sky."""
@@ -182,8 +183,9 @@ class ChannelInformation:
         mean, covariance, drawn = sky.mean[:n], sky.covariance[:n, :n], sky.draws[:, :n]
         if unknowns is not None:
             if tied is not None:
-                shared = in_common(unknowns, self.above, tied, number)
-                given = unknowns.amplitudes if self.above is None else self.above.amplitudes
+                reference = np.asarray(self.information.reference)
+                shared = in_common(unknowns, self.above, tied, number, reference)
+                given = amplitudes_of(unknowns, self.above, reference)
                 unknowns = unknowns.given_all(given.with_shared(shared, sky.mean, sky.covariance))
             data = data.given(unknowns.table(mean, covariance))
         return channel_result(
@@ -695,16 +697,21 @@ def _with_sky_above(
     tied: Tied | None, channels: Sequence[Scenario], files: ChannelFiles
 ) -> tuple[Tied | None, float]:
     """Add the sky above lmax, if any, to what channels have in common, and its part of chi^2."""
+    n = len(channels)
 
     def above(number: int) -> SkyAbove | None:
         return files.read(channels[number], ChannelInformation).above
 
-    n = len(channels)
-    if any(above(k) is None for k in range(n)):
+    # the model of other channels ends at lmax
+    seeing = [k for k in range(n) if above(k) is not None]
+    if not seeing:
         return tied, 0.0
-    some = [above(k).directions for k in sorted({0, n // 2, n - 1})]
-    alike = AlikeAbove.of(some, np.stack([above(k).model for k in range(n)]))
-    each = ((one.directions, one.mean, one.covariance) for one in map(above, range(n)))
+    some = [above(k).directions for k in sorted({seeing[0], seeing[len(seeing) // 2], seeing[-1]})]
+    model = np.zeros((n, len(some[0])))
+    for k in seeing:
+        model[k] = above(k).model
+    alike = AlikeAbove.of(some, model)
+    each = {k: (one.directions, one.mean, one.covariance) for k in seeing if (one := above(k))}
     return replace(tied or Tied.of_nothing(n), above=alike), alike.misfit(each)
 
 
