@@ -86,7 +86,7 @@ def cholesky(matrix: Matrices, *, overwrite: bool = False) -> Matrices:
         if matrix.ndim > 2:
             return np.stack([cholesky(block) for block in matrix])
         lower = np.ascontiguousarray(matrix) if overwrite else matrix.copy(order="C")
-        if _called("dpotrf", b"U", len(lower), lower, len(lower)) != 0:
+        if _called("dpotrf", b"U", len(lower), lower, max(1, len(lower))) != 0:
             return np.full(matrix.shape, np.nan)
         return lower_triangle(lower, overwrite=True)
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)

@@ -167,6 +167,14 @@ def test_nothing_settles_without_steps(case, monkeypatch):
     assert (found != far.start()).any()
 
 
+def test_data_without_information_leave_the_parameters_as_they_were(case):
+    names = ("matrix", "vector", "misfit", "log_det")
+    empty = {name: np.zeros_like(getattr(case.information, name)) for name in names}
+    found = learning.learn(case.family, case.information.altered(**empty))
+    np.testing.assert_array_equal(found.parameters, case.family.hyperprior.start())
+    assert found.log_evidence == pytest.approx(-0.5 * N_DATA * np.log(2.0 * np.pi), abs=1e-9)
+
+
 def test_compressed_data_have_the_evidence_and_the_posterior_of_all():
     """Of the density of d itself; modes that the data hardly see need no numbers of their own."""
     rng, n, seen = np.random.default_rng(7), (LMAX + 1) ** 2, 30
