@@ -124,11 +124,19 @@ def sky_above(
         covariance, mean = learned, family.mean
         if learned is None:
             covariance = family.at(family.hyperprior.start()).covariance
-    covariance, seen = (np.asarray(x)[n:, n:] for x in (covariance, normal_matrix(coupling, noise)))
-    power = np.diagonal(seen) * np.diagonal(covariance)
-    power = np.add.reduceat(power, np.arange(scenario.lmax + 1, lmax + 1) ** 2 - n)
+    covariance = np.asarray(covariance)[n:, n:]
     root = linalg.checked_cholesky("the prior above lmax", covariance)
-    directions = linalg.main_directions(linalg.sandwich(seen, root), LEFT_OUT)
+    if noise.size < len(root):  # of few data: what their combinations see
+        white = np.asarray(noise.factor().whiten(np.asarray(coupling.dense())[:, n:]))
+        information, rows = (white**2).sum(0), linalg.times_lower(white, root, transpose=False)
+        combinations = linalg.main_directions(rows @ rows.T, LEFT_OUT)
+        directions = np.linalg.qr(rows.T @ combinations)[0]
+    else:
+        seen = np.asarray(normal_matrix(coupling, noise))[n:, n:]
+        information = np.diagonal(seen)
+        directions = linalg.main_directions(linalg.sandwich(seen, root), LEFT_OUT)
+    power = information * np.diagonal(covariance)
+    power = np.add.reduceat(power, np.arange(scenario.lmax + 1, lmax + 1) ** 2 - n)
     if (n_data := noise.size) * directions.shape[1] > MOST_NUMBERS:
         raise InputError(f"its effect on {n_data:,} data needs too much memory; average the data")
     directions = np.pad(root @ directions, ((n, 0), (0, 0)))

@@ -32,7 +32,10 @@ def engine(tmp_path_factory):
 
 
 def cluster_of(workers):
-    scheduler = {"cls": distributed.Scheduler, "options": {"host": "127.0.0.1", "port": 0}}
+    scheduler = {
+        "cls": distributed.Scheduler,
+        "options": {"host": "127.0.0.1", "port": 0, "dashboard": False},
+    }
     return distributed.SpecCluster(scheduler=scheduler, workers=workers)
 
 
@@ -199,6 +202,7 @@ def test_threads_of_this_process_leave_it_as_it_is(tmp_path):
     assert (blas_threads(0), gc.get_threshold(), os.getcwd()) == before
 
 
+@pytest.mark.essential
 def test_a_scheduler_without_workers_ends_the_run_where_it_is_told_to(tmp_path):
     dask = pytest.importorskip("dask")
     with (

@@ -62,8 +62,10 @@ def mapped(scenario, ending, tmp_path, monkeypatch):
     return result
 
 
-@pytest.mark.parametrize("ending", [(), (1,), (0, 2)])
-def test_a_joint_posterior_has_one(ending, scenario, channels, tmp_path, monkeypatch):
+@pytest.mark.parametrize("ending", [(), (1,), pytest.param((0, 2), marks=pytest.mark.essential)])
+def test_a_joint_posterior_has_one(
+    ending, scenario, channels, tmp_path, monkeypatch, numbers_alone
+):
     """Maps, their errors, and what it adds to chi^2 that no sky of the map explains."""
     joint = lb.load_scenario(scenario, overrides=["joint=true"])
     prior = (result := mapped(joint, ending, tmp_path, monkeypatch)).joint.prior
@@ -89,8 +91,10 @@ def test_a_joint_posterior_has_one(ending, scenario, channels, tmp_path, monkeyp
     assert result.joint.misfit_above == pytest.approx(one - apart, rel=0.1, abs=1e-3)
 
 
-@pytest.mark.parametrize("ending", [(), (1,)])
-def test_independent_channels_miss_the_same(ending, scenario, channels, monkeypatch, tmp_path):
+@pytest.mark.parametrize("ending", [pytest.param((), marks=pytest.mark.essential), (1,)])
+def test_independent_channels_miss_the_same(
+    ending, scenario, channels, monkeypatch, tmp_path, numbers_alone
+):
     """Errors of two channels are as alike as the sky that causes them, if all of it is one sky."""
     monkeypatch.setattr(sky_spectrum, "correlation_of_departures", lambda u: np.ones((3, 3)))
     result = mapped(scenario, ending, tmp_path, monkeypatch)

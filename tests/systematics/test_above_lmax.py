@@ -93,6 +93,24 @@ def test_main_directions_leave_out_as_little_as_singular_vectors(rows):
     assert left < 1.0 and found.shape[1] <= (beyond > 1.0).sum() + 2
 
 
+@pytest.mark.parametrize("top", [10, 24])
+def test_the_directions_of_few_and_of_many_data_hold_what_these_see(top):
+    """Their part of A' S' A'^T, in units of the noise, against all of it; of 256 data."""
+    runs = "observation={runs: [{cycles: 0.3}], step_s: 50000}"
+    setup = set_up(scenario(4, runs, f"noise.above_lmax={{margin: 1, least_lmax: {top}}}"))
+    n, above, n_data = 25, setup.above, setup.layout.size
+    assert (n_data < len(above.covariance)) == (top == 24)
+    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    rows = np.asarray(above.coupling.dense())[:, n:] / noise[:, None]
+    everything = rows @ above.covariance @ rows.T
+    left = everything - rows @ above.root[n:] @ above.root[n:].T @ rows.T
+    assert -1e-6 < np.trace(left) < above_lmax.LEFT_OUT
+    white = np.linalg.solve(np.linalg.cholesky(above.covariance), above.root[n:])
+    np.testing.assert_allclose(white.T @ white, np.eye(white.shape[1]), atol=1e-7)
+    expected = (rows**2 @ np.diagonal(above.covariance)).sum()
+    assert above.power.sum() == pytest.approx(expected, rel=1e-9)
+
+
 PRIORS = ["isotropic", pytest.param("local_scales", marks=pytest.mark.essential)]
 
 
