@@ -67,8 +67,13 @@ def origin_of(
 
 def identity_of(scenario: Scenario, *inputs: object) -> str:
     """Digest of everything that determines results: scenario, its files, inputs, and version."""
-    changed = [os.stat(path).st_mtime_ns for path in inputs_of(scenario)]
-    return text_hash(json.dumps([scenario.to_yaml(), changed, *map(str, inputs), __version__]))
+    given = scenario.to_yaml(), contents_of(scenario), *map(str, inputs), __version__
+    return text_hash(json.dumps(given))
+
+
+def contents_of(scenario: Scenario) -> str:
+    """Name and digest of every file that a scenario names, a line each."""
+    return "\n".join(f"{path} ({digest_of(path)[:12]})" for path in inputs_of(scenario))
 
 
 def inputs_of(

@@ -34,7 +34,7 @@ from lusee_bayes.report.rendering import render_text
 from lusee_bayes.results.finished_runs import Provenance, write_cubes, write_map
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, ValidationResult
 from lusee_bayes.runs.cost import demand_of, measured_experiment
-from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, contents_of, run_folder
 from lusee_bayes.sampling import datatree, least, programs
 from lusee_bayes.sampling.distributions import Marginal, TimesStudentT
 from lusee_bayes.sampling.hmc import CHUNK, Chains, Checkpoints, Sampler, Whitening, sample
@@ -92,6 +92,7 @@ def sample_together(
     several = len(experiments) > 1
     identity = {
         "scenario": "---\n".join(one.scenario.to_yaml() for one in experiments.values()),
+        "input file": "\n".join(contents_of(one.scenario) for one in experiments.values()),
         "data": " ".join(one.data.digest() for one in experiments.values()),
         "program": program.name,
         "program text": program.digest,
@@ -144,6 +145,7 @@ def sample_together(
         if rounds is not None and whitening is not None:
             sampler = replace_fields(sampler, algorithm=sampler.algorithm or "crank-nicolson")
     checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
+    checkpoints.chunks()  # a damaged one is no fault of the program
     times = []
     with stages.progress("sampling", sampler.warmup + sampler.draws) as update:
 

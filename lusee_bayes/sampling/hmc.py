@@ -216,10 +216,10 @@ def _given(value: Float[Array, "..."], log_det: float | Float[Array, ""]) -> Cal
     return reparametrised
 
 
-WHAT = "the description of an unfinished run (else delete its folder)"
+WHAT = "the description of an unfinished run (delete its folder to start again)"
 IDENTITY = "run.json"
 CHUNK_GLOB = "chunk-*.npz"
-CHECKPOINT = "a checkpoint (else delete it to continue from the one before)"
+CHECKPOINT = "a checkpoint (delete it to continue from the one before)"
 
 
 @dataclass(frozen=True)
@@ -594,8 +594,9 @@ def sample(
     # the first chunk with draws may begin in warmup
     first = max(0, sampler.warmup - drawn[0].iteration + len(drawn[0].draws["lp"]))
     kept = slice(first, first + sampler.draws)
+    # in one order of memory, so that sums are the same after a resumed run
     merged = {
-        name: np.concatenate([one.draws[name] for one in drawn]).swapaxes(0, 1)[:, kept]
+        name: np.concatenate([one.draws[name] for one in drawn]).swapaxes(0, 1)[:, kept].copy("C")
         for name in drawn[0].draws
     }
     return Chains(statistics={name: merged.pop(name) for name in STATISTICS}, sites=merged)

@@ -19,7 +19,7 @@ from lusee_bayes.core.reading import read_model
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.judge.measures import signal_to_noise
 from lusee_bayes.results.summaries import MapSummary
-from lusee_bayes.runs import channels, map_run
+from lusee_bayes.runs import channels, map_run, sample_run
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs.channels import map_channels
 from lusee_bayes.sampling.datatree import read_datatree
@@ -342,3 +342,24 @@ def test_joint_maps_of_low_frequencies_are_no_worse_than_independent_ones(tmp_pa
         z = (modes_to_map(channel.mean - channel.truth, nside) / channel.pixel_std)[centre]
         # lmax 10 resolves one or two places there: 3 sigma at most
         assert np.sqrt((z**2).mean()) < 3.0
+
+
+def test_a_run_knows_its_input_files_by_their_content(tmp_path, monkeypatch):
+    """Maps and samples are continued if a file is only touched, and not if it has other numbers."""
+    path, seen = tmp_path / "cl.txt", []
+    prior = f"prior={{spectrum_file: {path}}}"
+
+    def finished(folder, identity, sampler):
+        seen.append(identity)
+        raise lb.InputError("enough")
+
+    monkeypatch.setattr(sample_run, "_finished", finished)
+    for spectrum in ("0 1e9\n1 1e8\n", "0 1e9\n1 1e8\n", "0 1e9\n1 2e8\n"):
+        path.write_text(spectrum)
+        scenario = lb.load_scenario("fiducial", [*SMALL[1::2], "lmax=1", prior])
+        seen.append(folder_module.identity_of(scenario))
+        refuse("enough", lb.run_sample, scenario, tmp_path / "out", resume=True)
+    maps, samples = seen[::2], seen[1::2]
+    assert maps[0] == maps[1] != maps[2] and samples[0] == samples[1]
+    other = {name for name in samples[0] if samples[0][name] != samples[2][name]}
+    assert "input file" in other and str(path) in samples[0]["input file"]
