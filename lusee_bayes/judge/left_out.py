@@ -30,6 +30,8 @@ of all data is kept.
     chi^2_s = u_s^T D_ss^-1 u_s + h^T Q_s^-1 h,
     directions = tr (Q_s^-1 - Q^-1) of the sky.
 
+If Y L^-T is kept, W has more rows than columns, Q_s = L (1 - W^T W) L^T and h = L W^T c^-1 u_s.
+
 The data that remain have N_0 without the group, so that D loses ``D_:s D_ss^-1 D_s:``.
 """
 
@@ -449,10 +451,10 @@ class LeftOut:
         cells, blocks, places, some, root, b = chosen
         rank = max(len(self._lower), QUICK)
         if self._kept is not None:
-            if np.count_nonzero(some) > rank:
-                return None
             halves = (some[..., None] * x[np.ix_(blocks, places)] for x in self._kept)
             w, with_sky = (solve_roots(root, x).reshape(some.size, -1) for x in halves)
+            if np.count_nonzero(some) > rank:
+                return self._among_unknowns(w, b.ravel())
             return self._among_data(chosen, w, with_sky, b.ravel())
         independent = self._weights.ndim == 2
         whole = independent or (cells[blocks] == self._on_cells(self.present)[blocks]).all()
@@ -480,6 +482,13 @@ class LeftOut:
         solved = linalg.solve_lower(lower, np.column_stack([inside, with_sky]), transpose=False)
         chi2, directions = (float((x**2).sum()) for x in (solved[:, 0], solved[:, 1:]))
         return float((chosen.b**2).sum() - (inside**2).sum()) + chi2, directions
+
+    def _among_unknowns(self, w: Rows, b: Vector) -> Answer:
+        """The same for more data than unknowns: Q_s = L (1 - W^T W) L^T."""
+        lower = linalg.cholesky(np.eye(w.shape[1]) - w.T @ w, overwrite=True)
+        h = linalg.solve_lower(lower, (w.T @ b)[:, None], transpose=False)
+        directions = self._trace_of_sky(self._lower @ lower) - self._trace
+        return float((b**2).sum() + (h**2).sum()), directions
 
     # --- groups that are removed from Q -------------------------------------------------------
 
