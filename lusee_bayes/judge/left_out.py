@@ -452,10 +452,10 @@ class LeftOut:
         rank = max(len(self._lower), QUICK)
         if self._kept is not None:
             halves = (some[..., None] * x[np.ix_(blocks, places)] for x in self._kept)
-            w, with_sky = (solve_roots(root, x).reshape(some.size, -1) for x in halves)
+            rows = (solve_roots(root, x).reshape(some.size, -1) for x in halves)
             if np.count_nonzero(some) > rank:
-                return self._among_unknowns(w, b.ravel())
-            return self._among_data(chosen, w, with_sky, b.ravel())
+                return self._among_unknowns(next(rows), b.ravel())
+            return self._among_data(chosen, *rows, b.ravel())
         independent = self._weights.ndim == 2
         whole = independent or (cells[blocks] == self._on_cells(self.present)[blocks]).all()
         if not whole or len(blocks) > rank:

@@ -75,7 +75,7 @@ The factors s_kj are those of the correlation of model skies.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -455,17 +455,17 @@ class AlikeAbove:
         """Number of common unknowns."""
         return self.directions.shape[1] * self.strengths.shape[1]
 
-    def misfit(self, channels: Mapping[int, tuple[Columns, Vector, Square]]) -> float:
+    def misfit(self, channels: Iterable[tuple[int, Columns, Vector, Square]]) -> float:
         """What one x adds to the sum of chi^2 of channels with an x each: zero on average.
 
         Parameters
         ----------
-        channels : mapping of int to ((others, n), (n,), (n, n)) arrays
-            By number: D_k, and mean and covariance of the amplitudes from the channel's own data.
+        channels : iterable of (int, (others, n) array, (n,) array, (n, n) array)
+            Number, D_k, and mean and covariance of the amplitudes from the channel's own data.
         """
         one = np.eye(self.size)
         precision, vector, square = one, np.zeros(len(one)), 0.0
-        for number, (directions, mean, covariance) in channels.items():
+        for number, directions, mean, covariance in channels:
             root = self.root(number, directions)
             inverse = np.linalg.inv(one - root.T @ root + root.T @ covariance @ root)
             pull = inverse @ (root.T @ mean)

@@ -449,29 +449,28 @@ def draws_with_parameters(
     drawn = np.empty((n, information.n_modes))
     if not n:
         return drawn
-    root = np.linalg.cholesky(learned.scores.covariance)
     compressed = Compressed.of(information, family.mean, np.asarray(learned.prior.variance()))
     sets = max(min(-(-n // 2), LEAST), -(-n // SHARED))
 
     def some(k: int) -> None:
         subkey = jax.random.fold_in(key, k)
-        prior = _under_drawn_parameters(family, learned, root, subkey)
-        subkey = jax.random.fold_in(subkey, ATTEMPTS)
-        drawn[k::sets] = compressed.sample(prior, subkey, len(drawn[k::sets]))
+        few = len(drawn[k::sets])
+        drawn[k::sets] = _under_drawn_parameters(family, learned, compressed, subkey, few)
 
     in_threads(some, range(sets))
     return drawn
 
 
 def _under_drawn_parameters(
-    family: PriorFamily, learned: Learned, root: Square, key: PRNGKeyArray
-) -> Prior:
-    scores = learned.scores.mean
+    family: PriorFamily, learned: Learned, compressed: Compressed, key: PRNGKeyArray, n: int
+) -> Draws:
+    scores, root = learned.scores.mean, np.linalg.cholesky(learned.scores.covariance)
     for attempt in range(ATTEMPTS):
         z = jax.random.normal(jax.random.fold_in(key, attempt), (len(root),), dtype=jnp.float64)
         parameters = family.hyperprior.near(scores, scores + root @ np.asarray(z))
         try:
-            return family.prior(family.at(parameters).covariance)
+            prior = family.prior(family.at(parameters).covariance)
+            return compressed.sample(prior, jax.random.fold_in(key, ATTEMPTS), n)
         except InputError as error:
             failed = error
     why = f"cannot draw skies with uncertain prior parameters: {failed}; use prior.model=isotropic"

@@ -703,15 +703,15 @@ def _with_sky_above(
         return files.read(channels[number], ChannelInformation).above
 
     # the model of other channels ends at lmax
-    seeing = [k for k in range(n) if above(k) is not None]
-    if not seeing:
+    skies = {k: one.model for k in range(n) if (one := above(k)) is not None}
+    if not (seeing := [*skies]):
         return tied, 0.0
     some = [above(k).directions for k in sorted({seeing[0], seeing[len(seeing) // 2], seeing[-1]})]
     model = np.zeros((n, len(some[0])))
-    for k in seeing:
-        model[k] = above(k).model
+    model[seeing] = [*skies.values()]
     alike = AlikeAbove.of(some, model)
-    each = {k: (one.directions, one.mean, one.covariance) for k in seeing if (one := above(k))}
+    # one after the other: all together may be large
+    each = ((k, x.directions, x.mean, x.covariance) for k in seeing if (x := above(k)))
     return replace(tied or Tied.of_nothing(n), above=alike), alike.misfit(each)
 
 
